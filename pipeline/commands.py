@@ -1,4 +1,4 @@
-"""Commands for files of Gaussians: convert, render, evaluate."""
+"""The commands for files of Gaussians: convert, render, evaluate."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from pipeline.splats.reduce import reduce_gaussians
 
 @dataclass(frozen=True)
 class Rendering:
-    """Settings for rendering.
+    """The settings for rendering.
 
     Attributes:
-        background: "black" or "white"; None: the scene's, else black.
-        antialias: whether to apply Mip-Splatting's opacity compensation; None: as the scene was
-            trained, else no.
-        max_side: longer side to which larger views are reduced, in pixels; None: full size.
-        threads: number of threads; does not affect results.
+        background: "black" or "white"; None for that of the scene, else black.
+        antialias: Whether to apply Mip-Splatting's opacity compensation; None to do as the scene
+            was trained, else not.
+        max_side: The longer side in pixels to which larger views are reduced; None for full size.
+        threads: The number of threads, which does not affect results.
     """
 
     background: str | None
@@ -65,14 +65,14 @@ def convert(
     """Convert a file of Gaussians to the format of ``target``'s suffix.
 
     Args:
-        sh_degree, min_opacity, morton_order: see ``splats.reduce.reduce_gaussians``.
-        warnings: warnings are added to this list, also of what ``target`` does not hold.
+        sh_degree, min_opacity, morton_order: The arguments of ``splats.reduce.reduce_gaussians``.
+        warnings: The list that warnings are added to, also of what ``target`` does not hold.
 
     Returns:
-        Messages.
+        The messages for the user.
 
     Raises:
-        UserError: a file that cannot be read or written.
+        UserError: A file cannot be read or written.
     """
     check_suffix(target)
     found = read_gaussians(source, warnings)
@@ -94,16 +94,16 @@ def render(
     """Render a file of Gaussians from cameras, to 8-bit PNG files with the views' names.
 
     Args:
-        cameras: see ``read_cameras``.
-        names: views to render; empty: all.
-        how: settings for rendering.
-        warnings: warnings are added to this list.
+        cameras: The file that ``read_cameras`` reads.
+        names: The names of the views to render; empty for all.
+        how: The settings for rendering.
+        warnings: The list that warnings are added to.
 
     Returns:
-        Messages.
+        The messages for the user.
 
     Raises:
-        UserError: a file that cannot be read, or no view with one of the names.
+        UserError: A file cannot be read, or no view has one of the names.
     """
     posed = read_cameras(cameras, exported=is_exported(model))
     views = camera_views(posed, how.max_side)
@@ -148,7 +148,8 @@ def _check_views(views: Sequence[View], cameras: Path) -> None:
 
 
 def _png(folder: Path, name: str, taken: set[Path]) -> Path:
-    """A unique file for a view, inside ``folder`` even if the name is absolute or contains ".."."""
+    """The path of a view's file, unique and inside ``folder`` even if its name is absolute or
+    contains ".."."""
     inside = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     plain = folder.joinpath(*inside)
     short = plain.with_suffix(".png")
@@ -161,15 +162,15 @@ def evaluate(
     """Compare renders of a file of Gaussians, from any program, with a scene's photographs.
 
     Args:
-        scene, every: see ``posed_scene``.
-        out: folder for ``evaluation.json`` and ``renders/``; None: nothing is written.
-        how: settings for rendering.
+        scene, every: The arguments of ``posed_scene``.
+        out: The folder for ``evaluation.json`` and ``renders/``; None to write nothing.
+        how: The settings for rendering.
 
     Returns:
         The result of ``evaluate_views``, with the warnings of all steps.
 
     Raises:
-        UserError: a file or a scene that cannot be read.
+        UserError: A file or a scene cannot be read.
     """
     warnings: list[str] = []
     gaussians = read_gaussians(model, warnings)

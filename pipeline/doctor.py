@@ -24,7 +24,7 @@ PYTHON = (3, 11)
 LOW_DISK = 10 << 30
 LOW_MEMORY = 4 << 30
 VULKAN_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-# Distribution -> purpose.
+# The purpose of each distribution.
 NEEDED = {
     "torch": "training",
     "pycolmap": "camera poses",
@@ -44,8 +44,8 @@ class Finding:
     """A line of the report.
 
     Attributes:
-        state: "used", "there" (not used), "absent" (optional), "missing" (needed).
-        fix: what to do, if anything.
+        state: The word "used", "there" (not used), "absent" (optional) or "missing" (needed).
+        fix: The action that helps, if there is any.
     """
 
     topic: str
@@ -152,10 +152,10 @@ def _describe(library: native.NativeLibrary) -> str:
     """How the library was built.
 
     Raises:
-        UserError: it is not built, and there is no compiler.
+        UserError: The library is not built, and there is no compiler.
     """
     variants = targets.usable_variants(library.extensions)
-    # As in NativeLibrary.build: other variants only without a compiler.
+    # As in NativeLibrary.build, other variants are used only without a compiler.
     if native.find_compiler() is not None:
         variants = variants[:1]
     built = next(filter(None, map(library.find, variants)), None)
@@ -228,7 +228,7 @@ def _training_devices(has_graphics: bool) -> list[Finding]:
 
 
 def _vulkan_drivers() -> list[str]:
-    """Names of the drivers' manifests (ICD files)."""
+    """The names of the drivers' manifests (ICD files)."""
     listed = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
     if listed:
         files = [Path(name) for name in listed.split(os.pathsep)]

@@ -33,7 +33,7 @@ EXAMPLES = """examples:
 In a checkout, `python -m pipeline` is the same command, and
 `snakemake --cores all results/NAME/metrics.json` reconstructs data/NAME.
 """
-# Commands that pass further options to Snakemake.
+# The commands that pass further options to Snakemake.
 WORKFLOW_COMMANDS = ("run", "plan")
 # The largest whole number that an argument takes.
 _MAX_NUMBER = 1_000_000
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parse(arguments: list[str]) -> dict[str, Any]:
     parser = make_parser()
     if arguments[:1] and arguments[0] in WORKFLOW_COMMANDS:
-        # "--" before Snakemake's options is optional.
+        # The "--" before Snakemake's options is optional.
         mark = arguments.index("--") if "--" in arguments else len(arguments)
         known, others = parser.parse_known_args(arguments[:mark] + arguments[mark + 1 :])
         return vars(known) | {"options": others}
@@ -81,7 +81,7 @@ def make_parser() -> argparse.ArgumentParser:
     def command(
         name: str, run: Callable[..., int | None], text: str, about: str | None = None, **more: Any
     ) -> Callable[..., object]:
-        """Add a command; returns the ``add_argument`` of its parser."""
+        """Add a command, and return the ``add_argument`` of its parser."""
         sub = commands.add_parser(name, help=text, description=about, **more)
         sub.set_defaults(command=run)
         return sub.add_argument
@@ -126,8 +126,8 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-# Each command: its arguments, added by the function that it is given, and what it does. Commands
-# import what they need, so that --help and wrong options do not import torch.
+# Each command is a function that adds its arguments, and the function that runs it. Commands import
+# what they need, so that --help and wrong options do not import torch.
 
 
 def _add_workflow(add: Callable[..., object]) -> None:

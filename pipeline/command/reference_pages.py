@@ -1,7 +1,7 @@
 """``python -m pipeline.command.reference_pages [--check]``: the docs' pages of the command line and
 of the files that stages write.
 
-Made from the parser and the JSON schemas, so that they cannot disagree with the program.
+The pages are made from the parser and the JSON schemas, so that they agree with the program.
 """
 
 from __future__ import annotations

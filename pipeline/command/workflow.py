@@ -27,15 +27,15 @@ def snakemake_command(
     """The command line that makes ``results/<scene>/metrics.json``.
 
     Args:
-        scene: folder of photographs; its parent becomes ``data_root``.
-        preset: name of a preset; None: the configuration's.
-        cores: a number, or "all".
-        config: ``name=value`` entries, which override ``preset``.
-        profile: folder of a workflow profile, or the name of one of the program's.
-        options: further options of Snakemake.
+        scene: The folder of photographs. Its parent becomes ``data_root``.
+        preset: The name of a preset; None for the preset of the configuration.
+        cores: A number, or "all".
+        config: The ``name=value`` entries, which override ``preset``.
+        profile: The folder of a workflow profile, or the name of one of the program's profiles.
+        options: Further options of Snakemake.
 
     Raises:
-        UserError: no such folder, no Snakemake, or a configuration file that cannot be read.
+        UserError: The folder or Snakemake is missing, or a configuration file cannot be read.
     """
     if not scene.is_dir():
         raise UserError(
@@ -43,7 +43,7 @@ def snakemake_command(
             file=scene,
             fix="name the folder that holds the photographs of one scene",
         )
-    # Not resolved: a symbolic link's name is the scene's name.
+    # The path is not resolved: a symbolic link's name is the scene's name.
     folder = Path(os.path.abspath(scene))
     fault = name_fault(folder.name)
     if fault is not None:
@@ -74,8 +74,8 @@ def snakemake_command(
 
 
 def _config_files(options: Sequence[str]) -> list[Path]:
-    """The configuration files that Snakemake is given: it ends with a traceback if it cannot read
-    one."""
+    """The configuration files that Snakemake is given. The caller checks them, because Snakemake
+    ends with a traceback if it cannot read one."""
     files, takes = [], False
     for word in options:
         name, _, value = word.partition("=")
@@ -89,7 +89,7 @@ def _config_files(options: Sequence[str]) -> list[Path]:
 
 def replace_process(command: list[str]) -> NoReturn:
     """Replace this process by Snakemake, which then receives signals and sets the exit code."""
-    # Without it, Python looks for packages in the current folder first, which is the user's.
+    # Without this, Python looks for packages in the current folder first, which is the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}
     sys.stdout.flush()
     sys.stderr.flush()

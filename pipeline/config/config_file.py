@@ -18,10 +18,10 @@ def check_config_file(path: Path) -> None:
     """Check that a configuration file can be read as a mapping.
 
     Raises:
-        UserError: it is not a text in UTF-8, not YAML, not a mapping, or too large.
+        UserError: The file is not a text in UTF-8, not YAML, not a mapping, or too large.
     """
     try:
-        if path.is_fifo():  # A shell's <(command), which can be read once.
+        if path.is_fifo():  # A shell's <(command) can be read only once.
             return
         if path.exists() and not path.is_file():
             raise _wrong(path, "expected a file")
@@ -48,10 +48,10 @@ def _count(value: Any, known: dict[int, int]) -> int:
     """The number of values with all aliases expanded.
 
     Args:
-        known: id of a container -> its number; 0 while it is counted.
+        known: The number of values of each container by its id; 0 while it is counted.
 
     Raises:
-        ValueError: a container holds itself.
+        ValueError: A container holds itself.
     """
     if not isinstance(value, dict | list | set | tuple):
         return 1

@@ -30,7 +30,7 @@ PAGE, EXPERIMENTS_PAGE = (ROOT / name for name in REFERENCE)
 DEFAULTS = ROOT / "config" / "config.yaml"
 SCHEMAS = ROOT / "docs" / "schemas"
 
-# File of the results -> its model, imported by name: no module of the library imports one above it.
+# The model of each file of the results, imported by name: no module imports one above it.
 _RECORDS = {
     "stage.json": "pipeline.runtime.record:StageRecord",
     "run.json": "pipeline.runtime.record:RunRecord",
@@ -45,7 +45,7 @@ _RECORDS = {
     "partition.json": "pipeline.scene.blocks:Partition",
 }
 
-# Stage -> the model of its counters; a test compares them with the declarations.
+# The model of each stage's counters. A test compares them with the declarations.
 COUNTERS = {
     "inspect": "pipeline.photos.counters:InspectCounters",
     "decode": "pipeline.photos.counters:DecodeCounters",
@@ -275,7 +275,7 @@ def _model(place: str) -> type[BaseModel]:
 def _counters() -> type[BaseModel]:
     """A model with the counters of each stage as a field."""
     models = {stage: _model(place) for stage, place in COUNTERS.items()}
-    # The default: a scene has the counters of the stages that ran.
+    # The counters have a default, because a scene has only those of the stages that ran.
     fields: dict[str, Any] = {
         name: (model, Field(default_factory=model)) for name, model in models.items()
     }

@@ -16,9 +16,9 @@ from pipeline.config.section import FilePath, Seed
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import shortened, shown
 
-# Around a text that ``shown`` quotes.
+# The quotation marks around a text that ``shown`` quotes.
 _QUOTES = "'\""
-# The other pairs of a scene and a configuration are checked when their run is planned.
+# Further pairs of a scene and a configuration are checked when their run is planned.
 _MAX_PAIRS = 2000
 # Further errors are only counted, and longer messages and names of options are shortened.
 _MAX_ERRORS, _MAX_MESSAGE, _MAX_PART = 10, 200, 60
@@ -48,7 +48,7 @@ def _named_configs(value: Any) -> Any:
 
 
 class Project(Config):
-    """A configuration file: the options of a scene, and those of the project."""
+    """A configuration file: the options of a scene, and the options of the project."""
 
     data_root: FilePath = Field("data", description="Folder with one subfolder per scene.")
     configs: Annotated[dict[str, dict[str, Any]], BeforeValidator(_named_configs)] = Field(
@@ -72,13 +72,13 @@ def load_project(raw: Mapping[str, Any]) -> tuple[Project, dict[str, Config]]:
     """Validate a configuration.
 
     Args:
-        raw: the configuration as nested dicts.
+        raw: The configuration as nested dicts.
 
     Returns:
         The project, and the options of each scene named in ``scenes``.
 
     Raises:
-        UserError: an unknown option or an impossible value, naming it.
+        UserError: An option is unknown or its value is impossible; the message names it.
     """
     project = _validated(Project, raw, "")
     named = {name: scene_config(raw, name) for name in project.scenes}
@@ -91,16 +91,16 @@ def load_project(raw: Mapping[str, Any]) -> tuple[Project, dict[str, Config]]:
 def scene_config(
     raw: Mapping[str, Any], scene: str, config: str = "", seed: int | None = None
 ) -> Config:
-    """Options of one scene: schema < preset < project < scene < configuration, later ones first.
+    """A scene's options: schema < preset < project < scene < configuration, later ones first.
 
     Args:
-        raw: the configuration as nested dicts.
-        scene: its name.
-        config: name of one of ``configs``, or empty.
-        seed: takes precedence over the options; or None.
+        raw: The configuration as nested dicts.
+        scene: The scene's name.
+        config: The name of one of ``configs``, or empty.
+        seed: The seed, which takes precedence over the options; or None.
 
     Raises:
-        UserError: an unknown option or an impossible value, naming it.
+        UserError: An option is unknown or its value is impossible; the message names it.
     """
     own = (raw.get("scenes") or {}).get(scene) or {}
     chosen = merge({k: v for k, v in raw.items() if k in Config.model_fields}, own)
@@ -116,7 +116,7 @@ def scene_config(
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` updated by ``over``, nested mappings merged."""
+    """The values of ``base`` updated by those of ``over``, with nested mappings merged."""
     merged = dict(base)
     for name, value in over.items():
         old = merged.get(name)

@@ -20,7 +20,7 @@ def sections_of(field: FieldInfo) -> tuple[type[BaseModel], ...]:
 
 
 def option_paths(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[str]:
-    """Dotted paths of all options that decide a result, in the order of the schema.
+    """The dotted paths of all options that decide a result, in the order of the schema.
 
     Alternatives of a union have their options at the same place: each path comes once.
     """
@@ -39,10 +39,10 @@ def _all_paths() -> tuple[str, ...]:
 
 
 def select(config: Config, paths: Iterable[str]) -> dict[str, Any]:
-    """The values of the options at or below ``paths``, nested as in the schema, JSON types.
+    """The values of the options at or below ``paths``, nested as in the schema, of JSON types.
 
     Raises:
-        KeyError: there is no such option.
+        KeyError: There is no such option.
     """
     dumped = config.model_dump(mode="json")
     selected: dict[str, Any] = {}
@@ -55,6 +55,6 @@ def select(config: Config, paths: Iterable[str]) -> dict[str, Any]:
             source, target = dumped, selected
             for section in sections:
                 source, target = source[section], target.setdefault(section, {})
-            if option in source:  # another alternative of a union has it
+            if option in source:  # Otherwise another alternative of a union has it.
                 target[option] = source[option]
     return selected

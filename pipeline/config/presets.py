@@ -1,4 +1,4 @@
-"""Values of the presets, over the defaults of the schema."""
+"""The values of the presets, which replace defaults of the schema."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs of a batch: a scene with one configuration and seed, and the name of its results folder.
+"""The runs of a batch: a scene with one configuration and seed, and the name of its results folder.
 
 ``fox`` is the scene with the project's options, ``fox@fast`` with the configuration ``fast``,
 ``fox@fast@seed1`` and ``fox@seed1`` the same with another seed.
@@ -23,9 +23,9 @@ class Run:
     """One run of the pipeline on a scene.
 
     Attributes:
-        scene: name of the scene's folder.
-        config: name of a configuration in ``configs``, or empty for the project's options.
-        seed: replaces the configured seed; None keeps it.
+        scene: The name of the scene's folder.
+        config: The name of a configuration in ``configs``, or empty for the project's options.
+        seed: The seed that replaces the configured one; None keeps it.
     """
 
     scene: str
@@ -34,7 +34,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of the folder below ``results/``."""
+        """The name of the run's folder below ``results/``."""
         seed = "" if self.seed is None else f"seed{self.seed}"
         return "@".join(part for part in (self.scene, self.config, seed) if part)
 
@@ -43,9 +43,9 @@ def parse_run(name: str, configs: Collection[str], scenes: Collection[str] = ())
     """The run with this name: the inverse of ``Run.name``.
 
     Args:
-        name: a folder's name below ``results/``.
-        configs: names of all configurations.
-        scenes: names of scenes, which take precedence even if they look like those of runs.
+        name: The name of a folder below ``results/``.
+        configs: The names of all configurations.
+        scenes: The names of scenes, which take precedence even if they look like those of runs.
     """
     if name in scenes:
         return Run(name)
@@ -65,7 +65,7 @@ def is_config_name(name: str) -> bool:
 
 
 def name_fault(name: str) -> str | None:
-    """Why no folder of results can have this name; None if one can.
+    """The reason why no folder of results can have this name; None if one can.
 
     Snakemake takes braces and angle brackets for its own syntax, and a repeated end for a cycle.
     """

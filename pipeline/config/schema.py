@@ -362,11 +362,11 @@ ExportFormat = Literal[
     "video",
 ]
 ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
-# Formats that need multi-view stereo.
+# The formats that need multi-view stereo.
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
-# Formats that need renders of the views.
+# The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
 

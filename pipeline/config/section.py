@@ -17,7 +17,7 @@ _MAX_PATH = 4000
 
 
 class Section(BaseModel):
-    """A section of options: unknown names are errors, values do not change."""
+    """A section of options. Unknown names are errors, and values do not change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

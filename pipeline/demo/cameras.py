@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 FOCAL_MM = 28
 SENSOR_WIDTH_MM = 36.0
-# Largest angle between neighbours at which SIFT still matches: fewer views give a shorter arc.
+# The largest angle between neighbours at which SIFT still matches: fewer views give a shorter arc.
 MAX_STEP_DEGREES = 12.0
 
 LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
@@ -23,14 +23,14 @@ LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
     "fisheye_190": ("OPENCV_FISHEYE", (-0.02, 0.001, 0.0, 0.0)),
     "equirectangular": ("EQUIRECTANGULAR", ()),
 }
-# Lenses with rays at 90 degrees and more from the optical axis, and the radius of the image circle
-# as a share of the shorter side (None: the whole image).
+# The lenses with rays at 90 degrees and more from the optical axis, and the radius of the image
+# circle as a share of the shorter side (None for the whole image).
 WIDE: dict[str, float | None] = {"fisheye_190": 0.48, "equirectangular": None}
 FISHEYE_HALF_ANGLE = np.radians(95)
 
 
 def lens(distortion: str, width: int, height: int) -> Camera:
-    """The demo's camera: ``distortion`` is a key of ``LENSES``; sizes in pixels."""
+    """The demo's camera. ``distortion`` is a key of ``LENSES``; the sizes are in pixels."""
     model, coefficients = LENSES[distortion]
     if model == "EQUIRECTANGULAR":
         return Camera(model, width, height, np.array([width, height], np.float64))
@@ -45,13 +45,13 @@ def lens(distortion: str, width: int, height: int) -> Camera:
 
 
 def focal_35mm(width: int, height: int) -> int:
-    """EXIF's FocalLengthIn35mmFilm: from the diagonal, 43.27 mm on film (CIPA DCG-001)."""
+    """EXIF's FocalLengthIn35mmFilm by the diagonal, which is 43.27 mm on film (CIPA DCG-001)."""
     sensor_diagonal = SENSOR_WIDTH_MM * float(np.hypot(1.0, height / width))
     return round(FOCAL_MM * float(np.hypot(36.0, 24.0)) / sensor_diagonal)
 
 
 def orbit(names: list[str], seed: int) -> list[PosedImage]:
-    """Cameras on a wavy ring around the objects, looking at them; neighbours in order."""
+    """Cameras on a wavy ring around the objects, looking at them, with neighbours in order."""
     rng = np.random.default_rng([seed, 1])
     step = np.radians(min(360.0 / len(names), MAX_STEP_DEGREES))
     start, radius_phase, height_phase = rng.uniform(0, 2 * np.pi, 3)

@@ -1,4 +1,4 @@
-"""Values of command line options."""
+"""The values of command line options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 
 
 def picture_size(text: str) -> tuple[int, int]:
-    """Width and height from WIDTHxHEIGHT."""
+    """The width and height from a text WIDTHxHEIGHT."""
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if not match:
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, found {text!r}")

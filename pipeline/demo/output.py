@@ -1,4 +1,4 @@
-"""What the writers of synthetic scenes share: the folder, processes, and given poses."""
+"""The folder, processes and given poses that all writers of synthetic scenes share."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Poses = Literal["none", "colmap", "transforms"]
 Result = TypeVar("Result")
-Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]  # columns, rows
+Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]  # The columns and rows.
 
 POINTS_PER_VIEW = 200
-# Relative tolerance of depths for the visibility of a point: depth varies within a pixel.
+# The relative tolerance of depths for the visibility of a point: depth varies within a pixel.
 DEPTH_AGREEMENT = 0.01
-# Views that a process takes at once: neighbours share what is computed for the first of them.
+# The number of views that a process takes at once: neighbours share what is computed for the first.
 MAX_CHUNK = 8
 
 
@@ -36,8 +36,8 @@ def new_scene(folder: Path, record: str, kind: str) -> Iterator[Path]:
     """A folder to write to, which replaces ``folder`` when everything is written.
 
     Args:
-        record: the file by which an older scene of the same kind is recognised.
-        kind: what ``folder`` holds, for the message.
+        record: The file by which an older scene of the same kind is recognised.
+        kind: The content of ``folder`` in words, for the message.
 
     Raises:
         UserError: ``folder`` holds something else.
@@ -60,13 +60,13 @@ def new_scene(folder: Path, record: str, kind: str) -> Iterator[Path]:
 def in_processes(
     function: Callable[[int], Result], count: int, processes: int, chunk: int = 1
 ) -> Iterator[Iterator[Result]]:
-    """Yields the results of ``function`` for 0 to ``count`` - 1, in order.
+    """Yield the results of ``function`` for 0 to ``count`` - 1, in order.
 
-    Processes, not threads: rendering is many short numpy calls, which hold the interpreter's lock.
-    Spawned, not forked: the caller may have started threads.
+    Rendering is many short numpy calls, which hold the interpreter's lock: threads would not help.
+    Processes are spawned, not forked, because the caller may have started threads.
 
     Args:
-        chunk: consecutive numbers that one process takes at once, if there are enough.
+        chunk: The number of consecutive calls that one process takes at once, if there are enough.
     """
     processes = min(processes, count)
     if processes == 1:
@@ -78,7 +78,7 @@ def in_processes(
 
 
 def pick_pixels(camera: Camera, views: int, seed: int) -> list[Pixels]:
-    """POINTS_PER_VIEW random pixels of each view: columns and rows."""
+    """The columns and rows of POINTS_PER_VIEW random pixels of each view."""
     rng = np.random.default_rng([seed, 3])
     size = POINTS_PER_VIEW
     return [
@@ -96,10 +96,10 @@ def surface_points(
     """Points on the surfaces with exact positions, and the views in which they are visible.
 
     Args:
-        truth: one camera, and the views in order.
-        picks: of each view, the pixels whose points are taken.
-        colours: of each view, (POINTS_PER_VIEW, 3) at these pixels.
-        depth_of: the (H, W) depth of a view by its number; 0 where there is no point.
+        truth: The model of one camera, and the views in order.
+        picks: The pixels of each view whose points are taken.
+        colours: The (POINTS_PER_VIEW, 3) colours of each view at these pixels.
+        depth_of: The function from a view's number to its (H, W) depth; 0 where there is no point.
     """
     camera = truth.cameras[1]
     xyz, rgb = [], []
@@ -136,7 +136,7 @@ def surface_points(
 def _visible(
     camera: Camera, posed: PosedImage, points: NDArray[np.float64], depth: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Indices of the points that a view sees, and their (N, 2) pixels."""
+    """The indices of the points that a view sees, and their (N, 2) pixels."""
     local = points @ posed.rotation.T + posed.translation
     front = local[:, 2] > 0.05
     xy = project(camera, local[:, :2] / np.where(front, local[:, 2], 1.0)[:, None])
@@ -148,7 +148,7 @@ def _visible(
 
 
 def transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
-    """nerfstudio's transforms.json: camera to world, x right, y up, z backwards."""
+    """The content of nerfstudio's transforms.json: camera to world, x right, y up, z backwards."""
     fx, fy, cx, cy = camera.pinhole
     rest = camera.distortion.tolist()
     fisheye = "FISHEYE" in camera.model

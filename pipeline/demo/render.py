@@ -16,11 +16,11 @@ from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
 
-SAMPLES = 2  # rays per pixel and axis
-# Sigma of the lens blur, pixels: avoids aliasing, also in the Bayer mosaic.
+SAMPLES = 2  # Rays per pixel and axis.
+# The sigma of the lens blur in pixels. It avoids aliasing, also in the Bayer mosaic.
 LENS_SIGMA = 0.65
-MARGIN = 3  # pixels rendered around the image for the lens blur
-# Sigma of the texture filter, pixels; the lens blur is applied in addition.
+MARGIN = 3  # Pixels rendered around the image for the lens blur.
+# The sigma of the texture filter in pixels; the lens blur is applied in addition.
 TEXTURE_SIGMA = 0.35
 RAYS_PER_BATCH = 32_768
 
@@ -31,8 +31,8 @@ class Rays:
     depth 1, or unit vectors for a wide lens, with NaN outside its image circle.
 
     Attributes:
-        fine: SAMPLES per pixel and axis, with a margin of MARGIN pixels.
-        centres: one per pixel, through its centre.
+        fine: The rays of SAMPLES per pixel and axis, with a margin of MARGIN pixels.
+        centres: The rays through the centres of the pixels.
     """
 
     fine: Array
@@ -41,14 +41,14 @@ class Rays:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Exact image and depth of a view.
+    """The exact image and depth of a view.
 
     Attributes:
-        light: (H, W, 3) float64 linear RGB; multiplied by alpha if ``transparent``.
-        coverage: (H, W) float64, share of the pixel covered by the visitor, the last object of
-            the scene (``visitor``), or by any object (``transparent``); else 1.
-        depth: (H, W) float32, z of the scene's surface at the pixel centre, for a wide lens its
-            distance, ignoring the visitor; 0 if there is no surface.
+        light: (H, W, 3) float64 linear RGB, multiplied by alpha if ``transparent``.
+        coverage: (H, W) float64 shares of the pixels covered by the visitor, the last object of the
+            scene (``visitor``), or by any object (``transparent``); else 1.
+        depth: (H, W) float32 z of the scene's surface at the pixel centre, or its distance for a
+            wide lens, ignoring the visitor; 0 if there is no surface.
     """
 
     light: Array
@@ -60,7 +60,8 @@ def rays(camera: Camera, wide: bool = False, max_angle: float = np.pi) -> Rays:
     """The rays of a camera.
 
     Args:
-        wide: the lens sees at 90 degrees and more from its axis, up to ``max_angle``, radians.
+        wide: Whether the lens sees at 90 degrees and more from its axis.
+        max_angle: The largest angle in radians from its axis at which a wide lens sees.
     """
     fine, centres = _grid(camera, SAMPLES, MARGIN, wide), _grid(camera, 1, 0, wide)
     if wide:
@@ -81,9 +82,9 @@ def render(
     """Render one view.
 
     Args:
-        through: ``rays(camera)``.
-        transparent: leave the room away; coverage is the objects' alpha.
-        visitor: the last thing does not belong to the scene; coverage is its share.
+        through: The rays of the camera (``rays(camera)``).
+        transparent: Whether to leave out the room. Coverage is then the objects' alpha.
+        visitor: Whether the last object does not belong to the scene. Coverage is then its share.
     """
     rows, columns = through.fine.shape[1:]
     flat = through.fine.reshape(3, -1)
@@ -114,10 +115,10 @@ def render(
 
 
 def developed(picture: NDArray, width: int, height: int) -> NDArray:
-    """(height, width, K) pixels of the light along the fine rays, through the lens blur.
+    """(height, width, K) pixel values of the light along the fine rays, through the lens blur.
 
     Args:
-        picture: (R, C, K), a value for each ray of ``Rays.fine``.
+        picture: (R, C, K) values, one for each ray of ``Rays.fine``.
     """
     picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), LENS_SIGMA * SAMPLES))
     shape = (height + 2 * MARGIN, SAMPLES, width + 2 * MARGIN, SAMPLES, picture.shape[-1])
@@ -137,15 +138,15 @@ def _grid(camera: Camera, samples: int, margin: int, wide: bool) -> Array:
 
 
 def _or_forward(vectors: Array) -> Array:
-    """(3, N) rays, the optical axis where there is none."""
+    """(3, N) rays, with the optical axis where there is none."""
     return np.where(np.isfinite(vectors[0]), vectors, np.array([[0.0], [0.0], [1.0]]))
 
 
 def _world(posed: PosedImage, points: Array) -> tuple[Array, Array]:
-    """Origin (3, 1) and directions (3, N) of rays: of depth 1, so that a hit's t is its z depth, or
-    unit vectors.
+    """The origin (3, 1) and the directions (3, N) of rays: of depth 1, so that a hit's t is its z
+    depth, or unit vectors.
 
-    Written out rather than a matrix product: BLAS may round differently with other threads.
+    The product is written out: BLAS may round differently with another number of threads.
     """
     right, down, forward = (row[:, None] for row in posed.rotation)
     return posed.centre[:, None], right * points[0] + down * points[1] + forward * points[2]

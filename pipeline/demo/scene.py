@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 ROOM = Box((0, 0, 1.5), (3.5, 3.5, 1.5), inside=True)
 LAMPS = np.array([[1.2, -0.9, 2.8], [-1.6, 1.2, 2.6]])
 LAMP_POWER = (0.75, 0.35)
-LAMP_SIZE = 0.5  # half the side of each lamp's panel; larger panels give softer shadows
+LAMP_SIZE = 0.5  # Half the side of each lamp's panel; larger panels give softer shadows.
 AMBIENT = 0.5
-LAMP_SAMPLES = 6  # per side of the grid over a panel
+LAMP_SAMPLES = 6  # Samples per side of the grid over a panel.
 SKY_SAMPLES = 48
 # Shadows come from a precomputed map of the middle of the floor; outside it there are none.
 SHADOW_REACH = 2.0
@@ -75,7 +75,7 @@ OBJECTS: tuple[SceneObject, ...] = (
         Material((0.48, 0.22, 0.08), (0.30, 0.18, 0.06), (-0.06, 0.08, 0.16), 0.04, 0.3, 18),
     ),
 )
-# Material of the moving object in scenes with masks; its position differs in each image.
+# The material of the moving object in scenes with masks; its position differs in each image.
 VISITOR = Material((0.30, 0.08, 0.40), (0.10, 0.06, 0.14), (0.20, 0.14, -0.10), 0.04, 0.3, 19)
 
 UP = np.array([[0.0], [0.0], [1.0]])
@@ -85,7 +85,7 @@ BACKGROUND = -1
 def trace(
     origin: Array, direction: Array, objects: tuple[SceneObject, ...]
 ) -> tuple[Array, NDArray]:
-    """First hits of rays from (3, 1) or (3, N) origins: (N,) t and (N,) index of the object, or
+    """The first hits of rays from (3, 1) or (3, N) origins: (N,) t, and (N,) index of the object or
     BACKGROUND for the room."""
     best = ROOM.hit(origin, direction)
     index = np.full(best.shape, BACKGROUND)
@@ -114,7 +114,7 @@ def shade(
     """(3, N) linear radiance along rays with hits at ``t``.
 
     Args:
-        blur: (N,) sigma of the texture filter at the hits, metres.
+        blur: (N,) sigmas of the texture filter at the hits in metres.
     """
     light = np.zeros(direction.shape)
     point = origin + t * direction
@@ -128,7 +128,7 @@ def shade(
             continue
         normal = objects[i].shape.normal(p)
         material = objects[i].material
-        # Near the floor part of the ambient light is occluded.
+        # Near the floor, a part of the ambient light is occluded.
         open_share = 0.72 + 0.28 * np.clip(p[2] / 0.25, 0, 1)
         colour = _albedo(material, p, s) * _irradiance(p, normal) * open_share
         if material.gloss > 0:
@@ -142,7 +142,7 @@ def _albedo(material: Material, point: Array, blur: Array) -> Array:
 
 
 def _irradiance(point: Array, normal: Array) -> Array:
-    """Light on a matte surface, unshadowed: the sky of the room and the lamps."""
+    """The light on a matte surface without shadows: from the sky of the room and the lamps."""
     total = AMBIENT * (0.8 + 0.2 * normal[2])
     for lamp, power in zip(LAMPS, LAMP_POWER, strict=True):
         total = total + _lamp_light(lamp, power, point, normal)
@@ -188,7 +188,7 @@ def _reflection(material: Material, direction: Array, point: Array, normal: Arra
 
 
 def _floor_irradiance(point: Array) -> Array:
-    """As ``_irradiance``, for (3, N) points on the floor, with the objects' soft shadows."""
+    """The light on (3, N) points of the floor as in ``_irradiance``, with soft shadows."""
     scale = (SHADOW_CELLS - 1) / 2
     u = np.clip((point[0] / SHADOW_REACH + 1) * scale, 0, SHADOW_CELLS - 1.001)
     v = np.clip((point[1] / SHADOW_REACH + 1) * scale, 0, SHADOW_CELLS - 1.001)
@@ -206,12 +206,12 @@ def _floor_irradiance(point: Array) -> Array:
 
 @cache
 def shadow_maps() -> Array:
-    """(1 + lamps, SHADOW_CELLS, SHADOW_CELLS): shares of the sky and of each lamp that are
-    visible from points on the floor. Computed once per process."""
+    """(1 + lamps, SHADOW_CELLS, SHADOW_CELLS) shares of the sky and of each lamp that are visible
+    from points on the floor. They are computed once per process."""
     side = np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_CELLS)
     x, y = (v.ravel() for v in np.meshgrid(side, side))
     point = np.stack([x, y, np.zeros_like(x)])
-    # Directions spread evenly over a disc and lifted to the half sphere: Malley's method.
+    # Directions are spread evenly over a disc and lifted to the half sphere: Malley's method.
     angle = np.arange(SKY_SAMPLES) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt((np.arange(SKY_SAMPLES) + 0.5) / SKY_SAMPLES)
     sky = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])

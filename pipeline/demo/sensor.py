@@ -1,4 +1,4 @@
-"""Converts linear light to files: sRGB images with EXIF, or the DNG of a Bayer sensor."""
+"""Conversion of linear light to files: sRGB images with EXIF, or the DNG of a Bayer sensor."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Array = NDArray[np.float64]
 MAKE, MODEL = "Splatmake", "Demo 1"
 JPEG_QUALITY = 95
 
-# XYZ (D65) to sensor colours: the ColorMatrix in DNG files of the Canon EOS 6D.
+# The matrix from XYZ (D65) to sensor colours: ColorMatrix in DNG files of the Canon EOS 6D.
 COLOR_MATRIX = np.array(
     [[0.7034, -0.0804, -0.1014], [-0.4420, 1.2564, 0.2058], [-0.0851, 0.1994, 0.5758]]
 )
-# Linear sRGB to XYZ (D65): IEC 61966-2-1.
+# The matrix from linear sRGB to XYZ (D65): IEC 61966-2-1.
 SRGB_TO_XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-BLACK_LEVEL, WHITE_LEVEL = 1024, 15360  # of 14 bits
+BLACK_LEVEL, WHITE_LEVEL = 1024, 15360  # Of 14 bits.
 RGGB = ((0, 1), (1, 2))
-# A whole sphere: Google's "Photo Sphere XMP Metadata".
+# Google's "Photo Sphere XMP Metadata" of a whole sphere.
 GPANO = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
     b'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
@@ -37,7 +37,7 @@ GPANO = (
 
 
 def srgb(light: Array) -> Array:
-    """Linear light in [0, 1] to sRGB values in [0, 1] (IEC 61966-2-1); clipped."""
+    """sRGB values in [0, 1] of linear light in [0, 1], clipped (IEC 61966-2-1)."""
     light = np.clip(light, 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
@@ -54,8 +54,8 @@ def write_picture(
     Wide lenses have no focal length in EXIF: a fisheye lens has a name, a panorama GPano metadata.
 
     Args:
-        taken: EXIF time, "YYYY:MM:DD hh:mm:ss".
-        distortion: a key of ``LENSES``.
+        taken: The EXIF time, "YYYY:MM:DD hh:mm:ss".
+        distortion: A key of ``LENSES``.
     """
     exif = Image.Exif()
     exif[271], exif[272], exif[274], exif[306] = MAKE, MODEL, 1, taken
@@ -69,7 +69,7 @@ def write_picture(
     else:
         photo[37386] = float(FOCAL_MM)
         photo[41486] = photo[41487] = pixels.shape[1] / SENSOR_WIDTH_MM * 10
-        photo[41488] = 3  # pixels per centimetre
+        photo[41488] = 3  # The unit is pixels per centimetre.
         photo[41989] = focal_35mm(pixels.shape[1], pixels.shape[0])
     exif[0x8769] = photo
     # Other formats ignore the options of JPEG.
@@ -83,10 +83,10 @@ def white_balance() -> Array:
 
 
 def expose(light: Array, noise: float, seed: tuple[int, int]) -> NDArray[np.uint16]:
-    """Linear (H, W, 3) light to an RGGB mosaic (H, W), 14 bits in uint16.
+    """The RGGB mosaic (H, W), 14 bits in uint16, of linear (H, W, 3) light.
 
     Args:
-        noise: standard deviation of the read noise, in sensor steps; 0 is none.
+        noise: The standard deviation of the read noise in sensor steps; 0 for none.
     """
     matrix = COLOR_MATRIX @ SRGB_TO_XYZ
     matrix = matrix / matrix.sum(axis=1, keepdims=True) * white_balance()[:, None]
@@ -94,7 +94,7 @@ def expose(light: Array, noise: float, seed: tuple[int, int]) -> NDArray[np.uint
     mosaic = np.empty((height, width))
     for dy, row in enumerate(RGGB):
         for dx, channel in enumerate(row):
-            # Written out: BLAS rounds differently with the number of threads.
+            # The product is written out: BLAS rounds differently with the number of threads.
             r, g, b = np.moveaxis(light[dy::2, dx::2], -1, 0)
             m = matrix[channel]
             mosaic[dy::2, dx::2] = m[0] * r + m[1] * g + m[2] * b

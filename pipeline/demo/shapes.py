@@ -16,7 +16,7 @@ NEAR = 1e-4
 
 class Shape(Protocol):
     def hit(self, origin: Array, direction: Array) -> Array:
-        """(N,) smallest t > NEAR with origin + t * direction on the surface, inf where none.
+        """(N,) smallest t > NEAR with origin + t * direction on the surface, inf where none is.
 
         ``origin`` is (3, 1) or (3, N); directions need not be unit vectors.
         """
@@ -91,7 +91,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Box:
-    """A box, rotated by ``yaw`` radians about the vertical; ``inside``: a room seen from inside."""
+    """A box, rotated by ``yaw`` radians about the vertical; with ``inside``, a room from within."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -106,7 +106,7 @@ class Box:
         start = self._local(origin - np.array(self.centre)[:, None])
         along = self._local(direction)
         half = np.array(self.half)[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face: inf, or a miss
+        with np.errstate(divide="ignore", invalid="ignore"):  # Rays along a face give inf or miss.
             a, b = (-half - start) / along, (half - start) / along
         enter, leave = np.minimum(a, b).max(0), np.maximum(a, b).min(0)
         t = leave if self.inside else enter
@@ -128,7 +128,7 @@ class Box:
 
 
 def _outside(excess: Array) -> Array:
-    """Signed distance from the (K, N) signed distances to K perpendicular bounds."""
+    """The signed distance of a body from the (K, N) signed distances of its perpendicular faces."""
     beyond = np.sqrt((np.maximum(excess, 0) ** 2).sum(0))
     return np.asarray(beyond + np.minimum(excess.max(0), 0))
 

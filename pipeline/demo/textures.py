@@ -16,19 +16,19 @@ Floats = NDArray[np.float32]
 
 BANDS = 6
 WAVES_PER_BAND = 8
-# Contrast: larger values saturate more of the texture at the ends of its colour range.
+# The contrast. Larger values saturate more of the texture at the ends of its colour range.
 STEEPNESS = 1.3
 
 
 @dataclass(frozen=True)
 class Material:
-    """Colours of a surface, linear light.
+    """The colours of a surface in linear light.
 
     Attributes:
         base, tint_a, tint_b: RGB; the colour is base + a tint_a + b tint_b with a and b in (-1, 1).
-        finest, coarsest: shortest and longest wavelength of the texture, world units.
-        seed: of the pattern.
-        gloss: reflectance at normal incidence; 0 is a matte surface.
+        finest, coarsest: The shortest and longest wavelength of the texture in world units.
+        seed: The seed of the pattern.
+        gloss: The reflectance at normal incidence; 0 is a matte surface.
     """
 
     base: tuple[float, float, float]
@@ -70,7 +70,7 @@ class Material:
 
 @cache
 def _waves(material: Material, which: int) -> list[tuple[float, Floats, Floats]]:
-    """Of each band: wavelength, (3, WAVES_PER_BAND, 1) wave vectors, (WAVES_PER_BAND, 1) phases."""
+    """Each band's wavelength, (3, WAVES_PER_BAND, 1) wave vectors, (WAVES_PER_BAND, 1) phases."""
     rng = np.random.default_rng([material.seed, which])
     bands = []
     for wavelength in np.geomspace(material.finest, material.coarsest, BANDS):

@@ -33,24 +33,24 @@ from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
-Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # a view's depth and colours
+Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # The depth and colours of a view.
 
 
 @dataclass(frozen=True)
 class DemoSpec:
-    """Options of the demo scene.
+    """The options of the demo scene.
 
     Attributes:
-        views: photographs, in order around the objects.
-        width, height: pixels.
-        format: "jpg" (quality 95), "png", or "dng" (a Bayer sensor's RAW).
-        distortion: a key of ``pipeline.demo.cameras.LENSES``.
-        poses: poses given as an input: "none", "colmap" (sparse/0) or "transforms" (.json).
-        points: whether sparse/0 has points.
-        alpha: PNG with the objects alone on a transparent ground.
-        masks: a ball that is elsewhere in each photograph, and masks/ that leave it out.
-        noise: read noise of RAW files, in steps of 14 bits.
-        seed: another seed, other camera positions.
+        views: The number of photographs, in order around the objects.
+        width, height: The size of the photographs in pixels.
+        format: The format "jpg" (quality 95), "png", or "dng" (a Bayer sensor's RAW).
+        distortion: A key of ``pipeline.demo.cameras.LENSES``.
+        poses: The poses given as an input: "none", "colmap" (sparse/0) or "transforms" (.json).
+        points: Whether sparse/0 has points.
+        alpha: Whether the photographs are PNG with the objects alone on a transparent ground.
+        masks: Whether the photographs show a moving ball, which masks/ leave out.
+        noise: The read noise of RAW files in steps of 14 bits.
+        seed: The seed of the camera positions.
     """
 
     views: int = 32
@@ -88,17 +88,17 @@ class DemoSpec:
 
 
 def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
-    """Write the demo scene; the same spec writes the same bytes at any number of processes.
+    """Write the demo scene. The same spec writes the same bytes at any number of processes.
 
     Inside ``folder``: ``images/``; ``sparse_gt/`` (COLMAP text, the exact cameras of the stored
     pixels); ``depth_gt/*.npy`` (float32 z at pixel centres, 0 where there is nothing);
     ``masks/``, ``sparse/0`` or ``transforms.json`` if asked for; ``demo.json`` (the spec).
 
     Args:
-        processes: number of views rendered at once; None is one per core.
+        processes: The number of views rendered at once; None for one per core.
 
     Raises:
-        UserError: options that do not go together, or ``folder`` holds something else.
+        UserError: The options do not go together, or ``folder`` holds something else.
     """
     spec.check()
     with new_scene(folder, "demo.json", "demo scene") as work:
@@ -143,8 +143,8 @@ def _rays(spec: DemoSpec) -> Rays:
 
 
 def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
-    """Render and write one view. Its depth and colours are returned for the points; depth is 0
-    in pixels of the visitor or without a surface."""
+    """Render and write one view, and return its depth and colours for the points. The depth is 0 in
+    pixels of the visitor or without a surface."""
     camera, posed = _camera(spec), _views(spec)[number]
     objects = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
     options = {"transparent": spec.alpha, "visitor": spec.masks}

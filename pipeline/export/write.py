@@ -35,7 +35,7 @@ from pipeline.splats.arrays import GaussianArrays, GaussianRows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
-# Formats of one file with the Gaussians.
+# The formats of one file with the Gaussians.
 GAUSSIAN_FORMATS = ("ply", "spz", "splat", "gltf")
 
 
@@ -44,16 +44,16 @@ class ExportScene:
     """A finished scene.
 
     Attributes:
-        trained: the Gaussians after training.
-        model: cameras and sparse points.
-        manifest: the photographs of the views.
-        views: all views, at the size of the photographs.
-        training_size_views: the same views at the size used in training.
-        georeference: frame of the poses; None for given poses in their own world.
-        given: the given poses before rounding; empty for estimated ones.
-        folder: final folder of the exported files.
-        dense: folder of the dense stage, None if it did not run.
-        partition: the blocks of the scene, None if it has one.
+        trained: The Gaussians after training.
+        model: The cameras and sparse points.
+        manifest: The photographs of the views.
+        views: All views, at the size of the photographs.
+        training_size_views: The same views at the size used in training.
+        georeference: The frame of the poses; None for given poses in their own world.
+        given: The given poses before rounding; empty for estimated ones.
+        folder: The final folder of the exported files.
+        dense: The folder of the dense stage; None if it did not run.
+        partition: The blocks of the scene; None if the scene is one block.
     """
 
     trained: GaussianArrays
@@ -69,13 +69,13 @@ class ExportScene:
 
     @property
     def normalization(self) -> Normalization:
-        """From the world of the given poses to the scene's."""
+        """The transformation from the world of the given poses to the scene's."""
         return IDENTITY if self.georeference is None else self.georeference.normalization
 
 
 @dataclass
 class ExportReport:
-    """What was exported, and messages to the user."""
+    """The exported files, and messages to the user."""
 
     counters: ExportCounters
     decisions: list[str] = field(default_factory=list)
@@ -84,16 +84,16 @@ class ExportReport:
 
 @dataclass(frozen=True)
 class _Files:
-    """What the writers write.
+    """The content that the writers write.
 
     Attributes:
-        scene: in the unit of the given poses, with the scene's origin, which suits float32.
-        gaussians: those of ``scene``, reduced.
-        blocks: (M,) number of the block of each of ``gaussians``.
-        model, views: those of ``scene`` in the given world: formats in double precision.
-        antialias: whether the Gaussians were trained with opacity compensation.
-        points: name of the file of points, None without one.
-        normalization: from the given world to the scene's.
+        scene: The scene in the unit of the given poses, with its own origin, which suits float32.
+        gaussians: The Gaussians of ``scene``, reduced.
+        blocks: (M,) numbers of the block of each of ``gaussians``.
+        model, views: The values of ``scene`` in the given world, for formats in double precision.
+        antialias: Whether the Gaussians were trained with opacity compensation.
+        points: The name of the file of points; None without one.
+        normalization: The transformation from the given world to the scene's.
     """
 
     scene: ExportScene
@@ -140,7 +140,7 @@ class _Files:
         return self.scene.dense
 
 
-# Format -> name of the file or folder, and its writer.
+# The name of the file or folder of each format, and its writer.
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
     "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
@@ -157,7 +157,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "dense_points": ("dense_points.ply", lambda path, f: f.write_dense_points(path)),
     "dense_maps": ("dense_maps", lambda path, f: f.write_dense_maps(path)),
 }
-# Formats in double precision, whose coordinates are those of the given world.
+# The formats in double precision, whose coordinates are those of the given world.
 _GIVEN_WORLD = ("points", "colmap", "colmap_text", "transforms", "dense_points")
 
 
@@ -217,7 +217,7 @@ def _in_given_unit(scene: ExportScene) -> ExportScene:
 
 
 def _warnings(files: _Files, config: Export) -> list[str]:
-    """What is lost in the files of Gaussians."""
+    """The warnings about what the files of Gaussians lose."""
     names = [WRITERS[name][0] for name in GAUSSIAN_FORMATS if name in config.formats]
     warnings = [text for name in names for text in losses(Path(name), files.gaussians)]
     return [*warnings, *(unmarked(names) if files.antialias else [])]
@@ -246,7 +246,7 @@ def _write_rendered_formats(
     report: ExportReport,
 ) -> None:
     """Write the formats that need renders of the trained Gaussians."""
-    # Imported here because it imports torch and is rarely used.
+    # The module is imported here because it imports torch and is rarely used.
     from pipeline.surface.outputs import write_rendered
 
     messages = write_rendered(

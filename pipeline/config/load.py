@@ -1,4 +1,4 @@
-"""Validates a configuration (files, ``--config``) and merges it into each scene's options."""
+"""Validation of a configuration (files, ``--config``), and merging into each scene's options."""
 
 from __future__ import annotations
 

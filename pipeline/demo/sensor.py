@@ -25,7 +25,7 @@ COLOR_MATRIX = np.array(
 SRGB_TO_XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-BLACK_LEVEL, WHITE_LEVEL = 1024, 15360  # Of 14 bits.
+BLACK_LEVEL, WHITE_LEVEL = 1024, 15360  # In steps of 14 bits.
 RGGB = ((0, 1), (1, 2))
 # Google's "Photo Sphere XMP Metadata" of a whole sphere.
 GPANO = (

@@ -1,4 +1,4 @@
-"""Writes the demo scene: a folder of photographs with exact ground truth."""
+"""Writing the demo scene: a folder of photographs with exact ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work on many photographs, each on a thread of its own in which OpenCV starts no more."""
+"""Work on many photographs, each on a thread of its own, in which OpenCV starts no others."""
 
 from __future__ import annotations
 

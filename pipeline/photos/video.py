@@ -259,8 +259,8 @@ def measure(video: VideoFile, threads: int = 1) -> Measured:
     for frame in _frames(Path(video.path), threads):
         if progress.done >= progress.total:  # The header counts too few frames, or none.
             progress.total = progress.done + 2
-        # Frames are reduced before they become grey, which is faster than the
-        # reverse; frames of another size than the header's become equally large too.
+        # Frames are reduced before they become grey, which is faster than the reverse; frames of
+        # another size than the header's become equally large too.
         small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         combed += is_combed(frame)

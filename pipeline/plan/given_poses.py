@@ -327,7 +327,7 @@ def _other_unit(focal: float) -> str:
 def _check_centre(image: PosedImage, source: str) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         distance = float(np.abs(image.centre).max())
-    if not distance <= MAX_COORDINATE:  # NaN from an overflow is not.
+    if not distance <= MAX_COORDINATE:  # This includes NaN from an overflow.
         raise UserError(
             f"{image.name}: expected a camera at most {MAX_COORDINATE:g} units from the origin, "
             f"found {distance:g}",

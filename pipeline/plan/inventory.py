@@ -170,7 +170,7 @@ class Inventory:
         path = self.chosen.path
         photos = "the scene folder itself" if path == "." else f"{path}/"
         poses = "another file" if self.poses is None else self.poses.source
-        if self.poses is not None and poses == ".":  # Several files in the scene folder.
+        if self.poses is not None and poses == ".":  # There are several pose files.
             poses = f"the set of {POSE_LABELS[self.poses.kind]}"
         reason = _KINDS[kind].reason.replace("{photos}", photos).replace("{poses}", poses)
         if kind == "unread":

@@ -147,7 +147,7 @@ def _found(at: SceneFolder, poses: GivenPoses | None) -> str | None:
 def _named(at: SceneFolder, poses: GivenPoses) -> str | None:
     """The ``ply_file_path`` of transforms.json; adds a warning if the scene lacks the file."""
     source = at.path / poses.path
-    if source.is_dir():  # Splits of a synthetic scene, whose files name no cloud.
+    if source.is_dir():  # The splits of a synthetic scene name no cloud.
         return None
     name = at.cache.get(
         source,

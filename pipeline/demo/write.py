@@ -50,7 +50,7 @@ class DemoSpec:
         alpha: Whether the photographs are PNG with the objects alone on a transparent ground.
         masks: Whether the photographs show a moving ball, which masks/ leave out.
         noise: The read noise of RAW files in steps of 14 bits.
-        seed: The seed of the camera positions.
+        seed: The seed of the camera positions, the points, the noise and the ball.
     """
 
     views: int = 32

@@ -111,7 +111,7 @@ class Scene:
         """Render colours, opacity and depth of a view, without exposure gains.
 
         Args:
-            view: one of ``views``, or a modified copy (``dataclasses.replace``).
+            view: One of ``views``, or a modified copy (``dataclasses.replace``).
         """
         return render_view(self.gaussians, view, self._protocol.options(self._train, self._threads))
 
@@ -165,9 +165,9 @@ def load(
     """Load a finished scene (``results/NAME``), or a scene folder with poses and a model.
 
     Args:
-        folder: the finished scene; or photographs with poses and without lens distortion.
-        model: file of Gaussians; None: those of the finished scene.
-        max_side: longer side to which larger views are reduced, in pixels; None: as in the
+        folder: The finished scene; or photographs with poses and without lens distortion.
+        model: The file of Gaussians; None: those of the finished scene.
+        max_side: The longer side to which larger views are reduced, in pixels; None: as in the
             finished scene, else full size.
         threads: threads for rendering; None: one per core.
 

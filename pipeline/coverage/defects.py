@@ -27,9 +27,9 @@ class Floaters:
     """Opaque Gaussians in front of cameras, nearer than any certain surface.
 
     Attributes:
-        count: number of floaters.
-        within: search distance from a camera, world units; 0 if no surface is certain.
-        cameras: number of floaters that a camera shows, by name of the camera, largest first.
+        count: The number of floaters.
+        within: The search distance from a camera, world units; 0 if no surface is certain.
+        cameras: The number of floaters that a camera shows, by name of the camera, largest first.
     """
 
     count: int
@@ -56,7 +56,7 @@ def floating(probe: ProbeView, observed: Observations, nearest: float) -> Bools:
 
     Args:
         observed: of the points of the probe view.
-        nearest: distance of the nearest certain surfaces, world units.
+        nearest: The distance of the nearest certain surfaces, world units.
     """
     shape = probe.empty.shape
     few = (observed.count < MIN_AGREEING).reshape(shape)

@@ -101,7 +101,7 @@ class WorldFrame:
 
     Attributes:
         up: (3,) unit vector.
-        unit: name of the unit of length; None if the scale is arbitrary.
+        unit: The name of the unit of length; None if the scale is arbitrary.
         normalization: from the world of the given poses, in which results are recorded, to that
             of the views.
     """

@@ -31,8 +31,8 @@ class ProbeView:
     """A camera at reduced size with a render of the trained scene.
 
     Attributes:
-        view: the camera, reduced to ``SIDE``.
-        focal: focal length in pixels at the full size: the geometric mean of fx and fy.
+        view: The camera, reduced to ``SIDE``.
+        focal: The focal length in pixels at the full size: the geometric mean of fx and fy.
         rgb: (H, W, 3) uint8 render.
         depth: (H, W) median depth (camera z, world units); inf if the ray meets no surface.
         min_depth, max_depth: (H, W) range of the finite depths in the 3 x 3 neighbourhood; inf if
@@ -133,8 +133,8 @@ def backproject(probe: ProbeView, background_depth: float, step: int = 1) -> Que
     """The world points that the pixels show, in row-major order.
 
     Args:
-        background_depth: depth of pixels whose ray meets no surface, world units.
-        step: stride in pixels, in both directions.
+        background_depth: The depth of pixels whose ray meets no surface, world units.
+        step: The stride in pixels, in both directions.
     """
     view, sampled = probe.view, slice(step // 2, None, step)
     depth = probe.depth[sampled, sampled]

@@ -25,10 +25,10 @@ def describe(
     """The position of a viewpoint as steps from existing photographs, and its viewing target.
 
     Args:
-        probes: probe views of the photographs.
+        probes: The probe views of the photographs.
         up: (3,) up vector of the world.
-        unit: name of the unit of length. None: lengths are given as percentages of the distance to
-            the subject.
+        unit: The name of the unit of length. None: lengths are given as percentages of the distance
+            to the subject.
     """
     place = viewpoint.view.centre
     centres = np.stack([probe.view.centre for probe in probes])
@@ -65,7 +65,7 @@ def _opposite(offsets: Doubles, order: NDArray[np.intp]) -> int | None:
 
     Args:
         offsets: (N, 3) horizontal vectors from the place to the cameras.
-        order: indices of the cameras, nearest first.
+        order: The indices of the cameras, nearest first.
     """
     first = offsets[order[0]]
     distance = np.linalg.norm(offsets, axis=1)

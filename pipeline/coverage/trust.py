@@ -139,7 +139,7 @@ def trust_map(
     order.
 
     Args:
-        background_depth: depth of pixels whose ray meets no surface, world units.
+        background_depth: The depth of pixels whose ray meets no surface, world units.
     """
     points = backproject(probe, background_depth)
     observed = collect_observations(photographs, points)

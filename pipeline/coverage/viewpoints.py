@@ -55,7 +55,7 @@ class Viewpoint:
     """A camera pose from which a photograph could be taken.
 
     Attributes:
-        view: the camera, at the size of the photographs.
+        view: The camera, at the size of the photographs.
         subject: (3,) world point on its optical axis.
         distance: from the camera to the subject, world units.
     """
@@ -70,10 +70,10 @@ class Proposal:
     """A viewpoint to photograph.
 
     Attributes:
-        viewpoint: the camera.
-        probe: render of the trained scene from there.
+        viewpoint: The camera.
+        probe: The render of the trained scene from there.
         unknown: 1 - mean trust of the render, with the photographs and the earlier proposals.
-        gain: by how much this proposal raises the mean trust of all candidates.
+        gain: By how much this proposal raises the mean trust of all candidates.
     """
 
     viewpoint: Viewpoint
@@ -88,8 +88,9 @@ class NextBestViews:
 
     Attributes:
         proposals: in the order in which they were chosen.
-        candidates: all viewpoints that were evaluated.
-        trust_before, trust_after: mean trust over the candidates without and with the proposals.
+        candidates: All viewpoints that were evaluated.
+        trust_before, trust_after: The mean trust over the candidates without and with the
+            proposals.
     """
 
     proposals: list[Proposal]
@@ -115,10 +116,10 @@ def propose_viewpoints(
     functions").
 
     Args:
-        views: cameras of the photographs, at full size.
-        probes: probe views of the same cameras, in the same order.
+        views: The cameras of the photographs, at full size.
+        probes: The probe views of the same cameras, in the same order.
         up: (3,) up vector of the world.
-        background_depth: depth of pixels whose ray meets no surface, world units.
+        background_depth: The depth of pixels whose ray meets no surface, world units.
     """
     candidates, shown = _render_candidates(_candidates(views, probes, up), render)
     if not candidates:

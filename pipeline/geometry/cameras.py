@@ -55,8 +55,8 @@ class Camera:
     """The intrinsics of a camera.
 
     Attributes:
-        model: a key of ``CAMERA_MODELS``.
-        width, height: pixels.
+        model: A key of ``CAMERA_MODELS``.
+        width, height: The pixels.
         params: (K,) float64 in the model's order; focal lengths and principal point in pixels,
             distortion coefficients for normalised coordinates.
     """

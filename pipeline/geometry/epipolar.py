@@ -84,7 +84,7 @@ def consistent_matches(one: Array, two: Array, tolerance: float) -> NDArray[np.b
 
     Args:
         one, two: (N, 3) unit directions.
-        tolerance: the largest angle between a direction and its epipolar plane, radians.
+        tolerance: The largest angle between a direction and its epipolar plane, radians.
     """
     count = len(one)
     if count < 2 * _SAMPLE_SIZE:

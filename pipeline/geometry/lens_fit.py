@@ -26,8 +26,8 @@ def fit_camera(
     """Fit a camera to ``lens`` by least squares over the pixels of the image.
 
     Args:
-        model: the model of the camera that is returned.
-        width, height: pixels.
+        model: The model of the camera that is returned.
+        width, height: The pixels.
         start: its parameters to start from, near those of ``lens``.
         lens: normalised coordinates (x / z, y / z), (..., 2), to pixels, (..., 2).
 

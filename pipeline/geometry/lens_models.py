@@ -33,8 +33,8 @@ class LensModel:
 
     Attributes:
         distort: normalised coordinates to those of the image.
-        undistort: the inverse; NaN without one.
-        fold_radius: the largest undistorted radius up to which the distorted one increases.
+        undistort: The inverse; NaN without one.
+        fold_radius: The largest undistorted radius up to which the distorted one increases.
     """
 
     distort: Callable[[Array, Array], Array]

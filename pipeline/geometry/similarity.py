@@ -50,9 +50,9 @@ class Noise:
     standard deviation therefore counts the expected one as a number of further residuals.
 
     Attributes:
-        sigma: expected standard deviation along a horizontal axis, in the target's unit.
-        count: the number of residuals that the expectation counts as; 0 if nothing is expected.
-        floor: lower bound of the estimate.
+        sigma: The expected standard deviation along a horizontal axis, in the target's unit.
+        count: The number of residuals that the expectation counts as; 0 if nothing is expected.
+        floor: The lower bound of the estimate.
     """
 
     sigma: float
@@ -87,10 +87,10 @@ class RobustFit(NamedTuple):
     Attributes:
         similarity: maps source points to target points.
         inliers: (N,) bool, the points that it was fitted to.
-        sigma: standard deviation of the weighted residuals along one axis of the ground plane, in
-            the target's unit.
-        observations: the number of measured coordinates of the inliers.
-        freedoms: the number of observations less the number of fitted parameters.
+        sigma: The standard deviation of the weighted residuals along one axis of the ground plane,
+            in the target's unit.
+        observations: The number of measured coordinates of the inliers.
+        freedoms: The number of observations less the number of fitted parameters.
         uncertainty: The uncertainty of the similarity, from its covariance.
     """
 
@@ -112,7 +112,7 @@ def robust_similarity(
         source, target: (N, 3) corresponding points, N >= 3.
         weight: (3,) or (N, 3) factors of the residuals along the target's axes; 0 for a coordinate
             that was not measured.
-        noise: the expected errors. Points with residuals above ``OUTLIER_SIGMAS`` times the
+        noise: The expected errors. Points with residuals above ``OUTLIER_SIGMAS`` times the
             estimated standard deviation are outliers.
 
     Returns:
@@ -186,7 +186,7 @@ def spread_of(residuals: Array, weight: Array, noise: Noise, parameters: int) ->
     Args:
         residuals: (N,) lengths.
         weight: (N, 3), 0 for a coordinate that was not measured.
-        parameters: the number of fitted parameters.
+        parameters: The number of fitted parameters.
     """
     # 1.1774 is the median of a Rayleigh distribution with sigma 1.
     robust = float(np.median(residuals)) / 1.1774

@@ -35,8 +35,8 @@ def upright_similarity(
         source, target: (N, 3) corresponding points, N >= 2.
         weight: (N, 3) factors of the residuals along the target's axes; 0 for a height that was not
             measured.
-        noise: the expected errors.
-        tilt: standard deviation of the vertical axis, radians.
+        noise: The expected errors.
+        tilt: The standard deviation of the vertical axis, radians.
 
     Returns:
         None if the source points lie above each other.

@@ -30,7 +30,7 @@ def read_cameras(path: Path, *, exported: bool = False) -> Reconstruction:
     Args:
         exported: for a results' folder, whether the model is an exported file: in the unit of the
             given poses. Otherwise the cameras are in the world that the scene was trained in.
-        path: the folder of a COLMAP model, a scene's or results' folder with a model in
+        path: The folder of a COLMAP model, a scene's or results' folder with a model in
             ``sparse/0``, or a ``transforms.json`` or its folder.
 
     Raises:
@@ -78,7 +78,7 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
     """The views with these names, in this order; names may omit the suffix.
 
     Args:
-        source: the file or folder of the views, for error messages.
+        source: The file or folder of the views, for error messages.
 
     Raises:
         UserError: no view has one of the names, or several have it.

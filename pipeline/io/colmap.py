@@ -20,7 +20,7 @@ from pipeline.scene.reconstruction import Points, Reconstruction
 
 def model_files(folder: Path) -> list[Path]:
     """The files ``cameras``, ``images`` and, if it exists, ``points3D`` of the COLMAP model in
-    ``folder``: the binary ones, else the text files, as in COLMAP. Empty without a model."""
+    ``folder``: The binary ones, else the text files, as in COLMAP. Empty without a model."""
     for suffix in (".bin", ".txt"):
         files = [folder / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
         if files[0].is_file() and files[1].is_file():
@@ -39,7 +39,7 @@ def read_model(folder: Path, *, points: bool = True) -> Reconstruction:
     Points are sorted by id.
 
     Args:
-        points: whether to read the points, which take most of the memory and time.
+        points: Whether to read the points, which take most of the memory and time.
 
     Raises:
         UserError: no model, malformed or truncated files, unknown camera models, poses or

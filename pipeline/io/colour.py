@@ -61,7 +61,7 @@ class Colours:
     """What a file says about its colours.
 
     Attributes:
-        profile: the ICC profile by which they are converted to sRGB; None if they are used as
+        profile: The ICC profile by which they are converted to sRGB; None if they are used as
             sRGB.
         name: The name of the colour space that is converted; empty for sRGB.
         fault: Why the colours are used as sRGB although the file says something else; empty

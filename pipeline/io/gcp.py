@@ -46,7 +46,8 @@ class GroundPoint:
         name: The name in the file, else "gcp1" and so on in the file's order.
         position: x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
             z in metres.
-        pixels: photograph's name -> pixel, COLMAP's convention (the first pixel's centre is 0.5).
+        pixels: The photograph's name -> pixel, COLMAP's convention (the first pixel's centre is
+            0.5).
     """
 
     name: str
@@ -112,8 +113,8 @@ def read_ground_control(
     """Read ``gcp_list.txt``.
 
     Args:
-        sizes: photographs of the scene -> width and height. Names match as in ``NameIndex``.
-        complete: whether these are all photographs; False if frames of videos will follow.
+        sizes: Photographs of the scene -> width and height. Names match as in ``NameIndex``.
+        complete: Whether these are all photographs; False if frames of videos will follow.
 
     Raises:
         UserError: the file is unreadable, has no projection, a malformed line, coordinates that the

@@ -58,7 +58,7 @@ def read_gps(tags: Mapping[int, Any], xmp: bytes = b"") -> Gps:
 
     Args:
         tags: EXIF's GPS directory.
-        xmp: the file's XMP packet, empty without one. It is used for what EXIF does not give.
+        xmp: The file's XMP packet, empty without one. It is used for what EXIF does not give.
     """
     found = _from_exif(tags)
     if found.position is not None and found.position[2] is not None:

@@ -28,8 +28,8 @@ def read_poses_bounds(path: Path, names: Sequence[str]) -> Reconstruction:
     """Read LLFF poses.
 
     Args:
-        path: the ``.npy`` file.
-        names: the photographs, sorted by name: row i belongs to photograph i.
+        path: The ``.npy`` file.
+        names: The photographs, sorted by name: row i belongs to photograph i.
 
     Returns:
         SIMPLE_PINHOLE cameras of the file's size, no points.

@@ -22,7 +22,7 @@ class MaskPixels:
 
     Attributes:
         valid: (H, W) True for pixels that count.
-        darkest: the largest value if it is below half of the range and every other value than 0
+        darkest: The largest value if it is below half of the range and every other value than 0
             counts, else None.
     """
 
@@ -37,7 +37,7 @@ def valid_pixels(picture: NDArray[Any], *, lossless: bool) -> MaskPixels:
     Args:
         picture: (H, W) grey, (H, W, 2) grey and alpha, (H, W, 3) colours or (H, W, 4) colours and
             alpha; uint8 or uint16.
-        lossless: whether the file has the values that a program wrote. Only then may all of them
+        lossless: Whether the file has the values that a program wrote. Only then may all of them
             be small: 0 and 1, or numbers of classes.
     """
     top = int(np.iinfo(picture.dtype).max)

@@ -230,9 +230,9 @@ def compare_names(
     positions.
 
     Args:
-        listed: the names in the file.
-        photos: the photographs' names.
-        same_positions: whether names may be those of photographs in several folders.
+        listed: The names in the file.
+        photos: The photographs' names.
+        same_positions: Whether names may be those of photographs in several folders.
     """
     index = NameIndex(photos)
     equal = {name: index.equal(name) for name in listed}

@@ -27,8 +27,8 @@ def panorama_of(xmp: bytes, body: str, width: int, height: int) -> Panorama:
     """Classify a photograph.
 
     Args:
-        xmp: the file's XMP packet, empty without one.
-        body: the camera's make and model from EXIF.
+        xmp: The file's XMP packet, empty without one.
+        body: The camera's make and model from EXIF.
         width, height: The size in pixels.
     """
     sphere = width == 2 * height

@@ -143,7 +143,7 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
     """An image file, opened by PIL; its pixels are not decoded yet.
 
     Args:
-        file: a path, or its bytes.
+        file: A path, or its bytes.
         name: The name of the file; its suffix decides which formats are tried.
 
     Raises:

@@ -54,7 +54,7 @@ def decode_photograph(data: bytes, name: str) -> Picture:
     or (H, W, 4) BGRA; uint8 or uint16, in sRGB.
 
     Args:
-        data: the file's bytes.
+        data: The file's bytes.
         name: The name of the file; its suffix decides which formats are tried.
 
     Raises:

@@ -30,7 +30,7 @@ def read_recorded(path: str | Path, digest: str | None) -> bytes:
     Decode these bytes instead of reading the file again, which may have changed since.
 
     Args:
-        digest: the recorded result of ``digest_of``; None: no check.
+        digest: The recorded result of ``digest_of``; None: no check.
 
     Raises:
         ChangedFileError: the file has another digest.

@@ -80,7 +80,7 @@ def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = 
     """Write Gaussians atomically, in the format of the suffix.
 
     Args:
-        antialias: whether the Gaussians were trained with Mip-Splatting's opacity compensation.
+        antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
 
     Returns:
         A sentence for everything that the format does not hold (``splat_losses``).

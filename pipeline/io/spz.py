@@ -104,7 +104,7 @@ def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:
     """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
 
     Args:
-        antialias: whether the Gaussians were trained with Mip-Splatting's opacity compensation,
+        antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation,
             with which viewers should render them.
 
     Raises:

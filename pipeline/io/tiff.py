@@ -27,11 +27,11 @@ class TiffLayout:
         width, height: The size as stored, in pixels.
         bits: The number of bits of the widest channel.
         samples: The number of channels.
-        whole: whether the values are unsigned integers.
-        separate: whether each channel is stored in a plane of its own.
-        inverted: whether 0 is white.
-        premultiplied: whether colours are multiplied by alpha.
-        alpha: whether the channel after the colours is alpha.
+        whole: Whether the values are unsigned integers.
+        separate: Whether each channel is stored in a plane of its own.
+        inverted: Whether 0 is white.
+        premultiplied: Whether colours are multiplied by alpha.
+        alpha: Whether the channel after the colours is alpha.
     """
 
     width: int

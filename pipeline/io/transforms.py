@@ -177,7 +177,7 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
     """All frames of a file or of the files in a scene folder, each path once: its first frame.
 
     Args:
-        repeated: the paths of the other frames are added to this list, except for equal frames:
+        repeated: The paths of the other frames are added to this list, except for equal frames:
             files of several splits may list the same frames.
 
     Raises:
@@ -210,8 +210,8 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     """Poses of the frames whose photographs exist.
 
     Args:
-        path: a scene folder or a file.
-        sizes: photograph (relative to the folder of the json) -> width and height in pixels.
+        path: A scene folder or a file.
+        sizes: The photograph (relative to the folder of the json) -> width and height in pixels.
             Frames of other photographs are omitted; suffixes may differ. Intrinsics refer to
             these sizes if the file has no ``w`` and ``h``.
 
@@ -261,8 +261,8 @@ def write_transforms(
     test and validation views.
 
     Args:
-        folder: the json's final folder, to which paths of photographs are relative.
-        points: the initial point cloud, relative to ``folder``.
+        folder: The json's final folder, to which paths of photographs are relative.
+        points: The initial point cloud, relative to ``folder``.
     """
 
     def relative(file: str) -> str:

@@ -84,7 +84,7 @@ def evaluate_views(
         appearance: of the Gaussians in photographs; None if it is not modelled. Views without an
             embedding of their own get one that is fitted on their left half, and are measured on
             the right half.
-        out: folder for the renders, ``<index>.png`` in the order of the views.
+        out: The folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:
         The measures and their protocol, without ``pose_error``.

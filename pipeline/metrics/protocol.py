@@ -22,15 +22,15 @@ class Protocol:
     """How the quality of a scene is measured.
 
     Attributes:
-        views: the evaluated views: the test views, or all views if there are none.
-        training_views: an even sample of the training views; empty without test views.
-        every: every n-th view, sorted by name, is a test view; 0: there are none, or the scene's
+        views: The evaluated views: the test views, or all views if there are none.
+        training_views: An even sample of the training views; empty without test views.
+        every: Every n-th view, sorted by name, is a test view; 0: there are none, or the scene's
             own split lists them.
-        num_training: number of training views.
-        listed: whether the views are test views of the scene's own split.
+        num_training: The number of training views.
+        listed: Whether the views are test views of the scene's own split.
         background: RGB in [0, 1] behind renders and transparent photographs.
-        near: near plane of the renders, as in training; world units.
-        extent: radius of the scene, world units (``scene_extent``).
+        near: The near plane of the renders, as in training; world units.
+        extent: The radius of the scene, world units (``scene_extent``).
     """
 
     views: list[View]

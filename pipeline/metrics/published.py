@@ -18,7 +18,7 @@ def against_published(
     """The published benchmark of a scene, with all that was done otherwise.
 
     Args:
-        name: a scene of ``PUBLISHED_SCENES``.
+        name: A scene of ``PUBLISHED_SCENES``.
         deviations: those known from the plan.
         protocol, evaluation: how the scene was measured, and the result.
     """

@@ -28,9 +28,9 @@ class Rendered:
     """A render and its photograph.
 
     Attributes:
-        view: name of the view.
+        view: The name of the view.
         rgb: (H, W, 3) float32.
-        own: the same in the scene's own colours; None if the appearance was not fitted.
+        own: The same in the scene's own colours; None if the appearance was not fitted.
         photo: (H, W, 3) uint8.
         mask: (H, W), False for ignored pixels; None if there are none.
     """
@@ -81,7 +81,7 @@ class ViewRenderer:
     """Renders the views of a protocol as their photographs show them.
 
     Attributes:
-        gains, appearance: see ``evaluate.evaluate_views``.
+        gains, appearance: See ``evaluate.evaluate_views``.
     """
 
     gaussians: Gaussians

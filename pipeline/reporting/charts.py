@@ -122,7 +122,7 @@ class ChartPoint:
         seconds, error: finite and positive.
         name: label; empty for a small point without a label.
         tip: tooltip.
-        colour: index of a colour of the page.
+        colour: The index of a colour of the page.
     """
 
     seconds: float
@@ -203,7 +203,7 @@ def histogram(
 
     Args:
         values: finite, at least one.
-        whole: one bar a whole number (or several, where there are more than ``bins``).
+        whole: One bar a whole number (or several, where there are more than ``bins``).
     """
     top = float(np.percentile(values, 99))
     if whole:

@@ -27,7 +27,7 @@ def collect_metrics(
     """Gather a scene's metrics.
 
     Args:
-        scene: name of the scene.
+        scene: The name of the scene.
         plan: of the scene.
         folder: ``results/<scene>``, which contains the folders of the stages.
         evaluation: of the evaluate stage.

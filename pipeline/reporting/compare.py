@@ -190,8 +190,8 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
     """A table of one batch, or of the differences between two, as lines of Markdown.
 
     Args:
-        batches: one or two ``benchmark.json``.
-        base: the configuration that others are compared with; None: the default preset.
+        batches: One or two ``benchmark.json``.
+        base: The configuration that others are compared with; None: the default preset.
         each: list the runs of one batch, without comparison.
 
     Raises:

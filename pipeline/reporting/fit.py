@@ -34,7 +34,7 @@ def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int)
 
     Args:
         centres: (C, 3) camera centres, world.
-        max_bytes: size limit.
+        max_bytes: The size limit.
     """
     step = max(len(gaussians) // _SAMPLE, 1)
     sample, degree, number = np.arange(0, len(gaussians), step), gaussians.sh_degree, 0

@@ -70,11 +70,11 @@ class Batch:
     """Content of the page of a batch.
 
     Attributes:
-        results: one per run, ordered by scene; at least one.
+        results: One per run, ordered by scene; at least one.
         renders: run's name -> render of a test view.
         photos: scene -> the photograph of that view.
         plans: scene -> plan of its first run.
-        stages: names in the order of the DAG.
+        stages: Names in the order of the DAG.
     """
 
     results: Sequence[Result]

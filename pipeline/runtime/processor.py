@@ -68,8 +68,8 @@ def darwin_features(intel: Iterable[str], arm: str) -> frozenset[str]:
     """The features in macOS's sysctl values, with Linux's names.
 
     Args:
-        intel: values of machdep.cpu.features, leaf7_features and extfeatures; may be empty.
-        arm: the values below hw.optional.arm, one ``name: value`` per line; may be empty.
+        intel: Values of machdep.cpu.features, leaf7_features and extfeatures; may be empty.
+        arm: The values below hw.optional.arm, one ``name: value`` per line; may be empty.
     """
     names = " ".join(intel).split()
     for line in arm.splitlines():

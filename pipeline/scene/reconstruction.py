@@ -20,8 +20,8 @@ class PosedImage:
     """An image with its pose.
 
     Attributes:
-        name: file name relative to the image folder, with "/" between folders.
-        camera_id: key into ``Reconstruction.cameras``.
+        name: The file name relative to the image folder, with "/" between folders.
+        camera_id: The key into ``Reconstruction.cameras``.
         rotation: (3, 3) float64, world to camera.
         translation: (3,) float64, world to camera, in world units.
     """

@@ -35,18 +35,18 @@ class View:
     """A pinhole camera with its photograph.
 
     Attributes:
-        name: the photograph's name.
-        image: file of the photograph.
-        mask: file of its mask (pixels with value 0 are ignored), or None.
-        width, height: size of the view in pixels (the file may be larger).
-        fx, fy, cx, cy: intrinsics in pixels at that size.
+        name: The photograph's name.
+        image: The file of the photograph.
+        mask: The file of its mask (pixels with value 0 are ignored), or None.
+        width, height: The size of the view in pixels (the file may be larger).
+        fx, fy, cx, cy: The intrinsics in pixels at that size.
         world_to_camera: (4, 4) float64.
-        is_test: whether this is a test view, which is not trained on.
-        camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
-        has_listed_split: whether the scene's own split says if this is a test view.
+        is_test: Whether this is a test view, which is not trained on.
+        camera_id: The key into ``Reconstruction.cameras``; views of one camera share intrinsics.
+        has_listed_split: Whether the scene's own split says if this is a test view.
         image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
-        source: name of the photograph of which this is a part; None for a whole photograph.
-        crop: the part of the image that the view shows; None: all of it.
+        source: The name of the photograph of which this is a part; None for a whole photograph.
+        crop: The part of the image that the view shows; None: all of it.
     """
 
     name: str
@@ -111,7 +111,7 @@ def load_views(
     of heights.
 
     Args:
-        views: the largest side of a view, and whether masks are used.
+        views: The largest side of a view, and whether masks are used.
         split: which views are test views.
 
     Raises:

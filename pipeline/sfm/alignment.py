@@ -35,7 +35,7 @@ def align_model(
     Args:
         method: "gcp" falls back to GPS, and "gps" to a level frame, with a warning. "none" is the
             level frame.
-        control: the scene's ``gcp_list.txt``, None without one.
+        control: The scene's ``gcp_list.txt``, None without one.
 
     Raises:
         UserError: ``gcp_list.txt`` is malformed or its coordinates are in another order or unit

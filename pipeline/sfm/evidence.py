@@ -33,8 +33,8 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
     """Compute the statistics of ``model``.
 
     Args:
-        database: the database that the model was mapped from.
-        total: number of photographs of the scene.
+        database: The database that the model was mapped from.
+        total: The number of photographs of the scene.
     """
     with pycolmap.Database.open(database) as opened:
         verified = _verified_pairs(opened)

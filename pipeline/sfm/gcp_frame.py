@@ -189,7 +189,7 @@ def _mistake(
     photographs would be upright: a triangle is congruent to its mirror image.
 
     Args:
-        given: the fit of the coordinates as they are, and its contradiction.
+        given: The fit of the coordinates as they are, and its contradiction.
     """
     fit, contradiction = given
     target = _local(control, places)[0]

@@ -32,7 +32,7 @@ def run_mapper(
     which threads finish.
 
     Args:
-        total: number of photographs in the database.
+        total: The number of photographs in the database.
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         run = _map_incremental if mapper == "incremental" else _map_global

@@ -81,7 +81,7 @@ def match_descriptors(
 
     Args:
         a, b: (F, 128), (G, 128) uint8, unit vectors times 512.
-        max_ratio: largest ratio of the distances to the nearest and the second nearest.
+        max_ratio: The largest ratio of the distances to the nearest and the second nearest.
 
     Returns:
         (M, 2) indices into ``a`` and ``b``, sorted by the first.

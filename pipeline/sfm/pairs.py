@@ -62,7 +62,8 @@ def spatial_pairs(
     pair.
 
     Args:
-        gps: latitude and longitude in degrees, altitude in metres or None; None without a position.
+        gps: The latitude and longitude in degrees, altitude in metres or None; None without a
+            position.
     """
     known = [i for i, position in enumerate(gps) if position is not None]
     if len(known) < 2:

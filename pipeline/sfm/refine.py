@@ -118,12 +118,12 @@ def bundle_adjust(
     """Robust bundle adjustment of points, poses and cameras, in place.
 
     Args:
-        free_principal_point: ids of cameras whose principal points are refined. If any, the
+        free_principal_point: The ids of cameras whose principal points are refined. If any, the
             intrinsics of all other cameras are constant.
-        loss_px: scale of the Cauchy loss, pixels.
-        tolerance: relative decrease of the cost at which the solver stops (Ceres'
+        loss_px: The scale of the Cauchy loss, pixels.
+        tolerance: The relative decrease of the cost at which the solver stops (Ceres'
             ``function_tolerance``).
-        inner_iterations: use Ceres' inner iterations (block coordinate descent after each step) if
+        inner_iterations: Use Ceres' inner iterations (block coordinate descent after each step) if
             their order is unique. They need about a third of the steps and pay for long tracks.
 
     Returns:
@@ -152,9 +152,9 @@ def adjust_points(
     """Adjust the points of a model in place; cameras and poses are fixed.
 
     Args:
-        loss_px: scale of the Cauchy loss, pixels.
-        done: ids of points to skip: ``bundle_adjust`` has adjusted them with these cameras and this
-            loss.
+        loss_px: The scale of the Cauchy loss, pixels.
+        done: The ids of points to skip: ``bundle_adjust`` has adjusted them with these cameras and
+            this loss.
     """
     options = _options(loss_px, FUNCTION_TOLERANCE)
     options.refine_focal_length = False

@@ -88,7 +88,7 @@ class GaussianRows:
 
     Attributes:
         rows: (M,) indices of the Gaussians, in their order.
-        sh_degree: degree of the spherical harmonics, at most that of ``source``.
+        sh_degree: The degree of the spherical harmonics, at most that of ``source``.
     """
 
     source: GaussianArrays

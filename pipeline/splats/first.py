@@ -26,7 +26,7 @@ class InitPoints:
 
     Attributes:
         source: what they are, for messages.
-        normals: see ``gaussians_from_points``.
+        normals: See ``gaussians_from_points``.
     """
 
     points: Points
@@ -56,9 +56,9 @@ def first_gaussians(
     "random" or there are fewer than ``MIN_POINTS``.
 
     Args:
-        training: the training views, for random initialisation and the scale of the scene.
+        training: The training views, for random initialisation and the scale of the scene.
         seed: of random initialisation.
-        skybox: whether to add one behind the Gaussians (``pipeline.splats.skybox``).
+        skybox: Whether to add one behind the Gaussians (``pipeline.splats.skybox``).
     """
     points, source = init.points, init.source
     method, warnings = config.method, []

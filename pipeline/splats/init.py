@@ -56,8 +56,8 @@ class InitGaussians(GaussianArrays):
     """Initial Gaussians.
 
     Attributes:
-        num_dropped: number of points left out because they are not finite, too near or too far.
-        num_thinned: number of points left out because there are more than ``Init.max_points``.
+        num_dropped: The number of points left out because they are not finite, too near or too far.
+        num_thinned: The number of points left out because there are more than ``Init.max_points``.
     """
 
     num_dropped: int = 0

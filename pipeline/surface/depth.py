@@ -30,7 +30,7 @@ class RenderedView:
     """Render and depth of a view.
 
     Attributes:
-        view: the camera.
+        view: The camera.
         rgb: (H, W, 3) uint8, over the background.
         median: (H, W) float32 camera z, world units, of the Gaussian at which the transmittance
             falls below one half; 0 if the pixel's opacity is below ``MIN_ALPHA``.
@@ -72,7 +72,7 @@ class DepthMap:
     """Depth observed by a view.
 
     Attributes:
-        view: the camera.
+        view: The camera.
         depth: (H, W) float32 camera z at pixel centres, world units; 0 if unknown, inf if the ray
             meets no surface.
         rgb: (H, W, 3) uint8.

@@ -56,7 +56,7 @@ def extract(field: Tsdf, min_weight: float) -> tuple[NDArray[np.float64], NDArra
     """Marching cubes (Lewiner et al. 2003) over cells whose corners were all observed.
 
     Args:
-        min_weight: voxels of less weight are treated as unobserved.
+        min_weight: Voxels of less weight are treated as unobserved.
 
     Returns:
         vertices (V, 3) float64, world, with at most one per grid edge; faces (F, 3).
@@ -159,7 +159,7 @@ def vertex_colors(
     of the viewing angle; grey if none does.
 
     Args:
-        tolerance: largest difference of depths for a vertex to be visible, world units.
+        tolerance: The largest difference of depths for a vertex to be visible, world units.
     """
     total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     parts = [slice(i, i + _VERTICES) for i in range(0, len(vertices), _VERTICES)]
@@ -191,7 +191,7 @@ def build_mesh(
     """Fuse depth maps to a mesh; the result is the same bits at any number of threads.
 
     Args:
-        voxel: side of a voxel, world units; None chooses one (see ``choose_grid``).
+        voxel: The side of a voxel, world units; None chooses one (see ``choose_grid``).
 
     Returns:
         The mesh and its grid; None if there is no surface.

@@ -47,10 +47,10 @@ def write_rendered(
     ``mesh.glb``, the video and its camera path ``path.json``.
 
     Args:
-        views: all views, at the size to render.
+        views: All views, at the size to render.
         options: The options of the rasterizer (``Protocol.options``).
         up: (3,) up vector of the world.
-        mesh_voxel: side of a voxel, world units; None chooses one.
+        mesh_voxel: The side of a voxel, world units; None chooses one.
     """
     messages = Messages([], [])
     if not {"renders", "depths", "mesh"}.isdisjoint(formats):

@@ -56,7 +56,7 @@ def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
 
     Args:
         views: At least one view.
-        depth: typical distance of the scene from the cameras, world units.
+        depth: The typical distance of the scene from the cameras, world units.
         up: (3,) unit vector, up in the world.
     """
     centres = np.stack([view.centre for view in views])

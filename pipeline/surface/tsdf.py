@@ -46,7 +46,7 @@ class Grid:
     """The voxels: those of ``blocks``.
 
     Attributes:
-        voxel: side, world units. Voxel (i, j, k) has its centre at (i, j, k) * voxel.
+        voxel: The side, world units. Voxel (i, j, k) has its centre at (i, j, k) * voxel.
         far: depths beyond this are free space up to ``far``, and no surface.
         blocks: (B, 3) int64, sorted; block b holds voxels b * 8 to b * 8 + 7.
     """
@@ -65,7 +65,7 @@ class Tsdf:
     """The fused field.
 
     Attributes:
-        grid: the voxels.
+        grid: The voxels.
         distance: (B, 8, 8, 8) float32, mean signed distance over the truncation, -1 to 1, positive
             in front of the surface; 0 where the weight is 0.
         weight: (B, 8, 8, 8) float32, number of views that saw a surface there, plus
@@ -82,7 +82,7 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
 
     Args:
         depths: iterated several times.
-        voxel: side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
+        voxel: The side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
             is enlarged if ``MAX_MESH_VOXELS`` would be exceeded, or if blocks are narrower than a
             pixel.
 

@@ -20,8 +20,8 @@ def refusal(host: str | None, origin: str | None, allowed: Collection[str]) -> s
     numbers are accepted as Host: no other page can have them as its own name.
 
     Args:
-        host, origin: the request's headers; None for one that it lacks.
-        allowed: further host names, without port.
+        host, origin: The request's headers; None for one that it lacks.
+        allowed: Further host names, without port.
     """
     name = _host_name(f"//{host}") if host is not None else None
     names = {"localhost", socket.gethostname().casefold(), *(a.casefold() for a in allowed)}

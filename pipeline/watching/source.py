@@ -37,8 +37,8 @@ class Source:
     """Reads the newest Gaussians of a path.
 
     Args:
-        path: a file of Gaussians, or ``results/NAME``, whose training may be running.
-        cameras: see ``read_cameras``; None: those of ``results/NAME``.
+        path: A file of Gaussians, or ``results/NAME``, whose training may be running.
+        cameras: See ``read_cameras``; None: those of ``results/NAME``.
 
     Raises:
         UserError: there are no Gaussians yet, or no cameras.

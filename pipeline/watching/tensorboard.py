@@ -28,7 +28,7 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
 
     Args:
         folders: results of runs (``results/NAME``), or the folder that contains them.
-        follow: keep writing new records until interrupted.
+        follow: Keep writing new records until interrupted.
 
     Returns:
         Lines that describe what was written.

@@ -49,12 +49,12 @@ class PoseFormat:
         names: what the names of images refer to. "photos": the folder of the photographs;
             "scene": the scene folder, so that the file lists the photographs; "order": the file
             has no names, its rows are the photographs sorted by name.
-        find: the pose file or folder in a scene folder, relative to it; None without one.
-        files: the files that the poses at a path consist of.
-        summarise: the fields of ``GivenPoses`` except ``kind`` and ``path``.
-        read: poses of existing photographs; the arguments are the path, photograph -> width and
+        find: The pose file or folder in a scene folder, relative to it; None without one.
+        files: The files that the poses at a path consist of.
+        summarise: The fields of ``GivenPoses`` except ``kind`` and ``path``.
+        read: The poses of existing photographs; the arguments are the path, photograph -> width and
             height in pixels, and, for "order", the names of all photographs.
-        frames: the frames at a path; None for formats that have no names or have points.
+        frames: The frames at a path; None for formats that have no names or have points.
     """
 
     kind: PoseKind
@@ -83,7 +83,7 @@ def of_frames(
     """A format without points, by the function that reads its frames.
 
     Args:
-        lost: the names of photographs that the files list without a pose.
+        lost: The names of photographs that the files list without a pose.
     """
     return PoseFormat(
         kind=kind,

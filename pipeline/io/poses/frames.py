@@ -39,8 +39,8 @@ class Lens:
     """The intrinsics of a frame, which may refer to the photograph's size.
 
     Attributes:
-        model: the camera model of the cameras that ``make`` returns.
-        make: the camera for a photograph of a width and height in pixels.
+        model: The camera model of the cameras that ``make`` returns.
+        make: The camera for a photograph of a width and height in pixels.
     """
 
     model: str
@@ -93,8 +93,8 @@ def reconstruct(
     """The frames whose photographs exist.
 
     Args:
-        sizes: photograph -> width and height in pixels.
-        file: the pose file, for error messages.
+        sizes: The photograph -> width and height in pixels.
+        file: The pose file, for error messages.
 
     Returns:
         Images named by the keys of ``sizes``, one camera for equal intrinsics, no points.

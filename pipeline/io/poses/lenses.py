@@ -157,8 +157,8 @@ def fitted(
     """The camera of a ``model`` that is fitted to ``lens``.
 
     Args:
-        near: a camera with the size and intrinsics to start from.
-        start: the distortion coefficients to start from.
+        near: A camera with the size and intrinsics to start from.
+        start: The distortion coefficients to start from.
 
     Raises:
         UserError: its largest error is ``MAX_RESIDUAL_PX`` or more.

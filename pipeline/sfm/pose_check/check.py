@@ -75,7 +75,7 @@ class _Fit:
 
     Attributes:
         angles: (M,) degrees.
-        half, most: the angles within which half and ``_SHARE`` of the matches are.
+        half, most: The angles within which half and ``_SHARE`` of the matches are.
     """
 
     angles: Array
@@ -171,11 +171,11 @@ def check_poses(
     """Compare given poses with the photographs' own matches.
 
     Args:
-        model: the given poses in the given world, with cameras of the photographs' sizes.
-        photos: the photographs, sorted by name.
-        kind: the format of the poses.
+        model: The given poses in the given world, with cameras of the photographs' sizes.
+        photos: The photographs, sorted by name.
+        kind: The format of the poses.
         source: their file, for the message.
-        matcher: the source of matches; default: one for this check alone.
+        matcher: The source of matches; default: one for this check alone.
 
     Raises:
         UserError: the matches contradict the poses; the message names the reading of the file that

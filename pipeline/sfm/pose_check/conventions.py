@@ -49,8 +49,8 @@ class Convention:
     """How a format writes a pose.
 
     Attributes:
-        rotation: the direction of its rotation.
-        position: whether it has the camera's centre, or the translation of world to camera.
+        rotation: The direction of its rotation.
+        position: Whether it has the camera's centre, or the translation of world to camera.
         axes: (3, 3) from the axes of its cameras to COLMAP's.
     """
 
@@ -116,7 +116,7 @@ class Reading:
     Attributes:
         cause: what the file looks like, as the end of "the poses look as if ...".
         fix: how to correct the file.
-        poses: the poses and cameras of this reading.
+        poses: The poses and cameras of this reading.
         rank: readings that are as good are preferred by the lowest rank.
     """
 

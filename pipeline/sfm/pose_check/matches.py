@@ -52,9 +52,9 @@ class MatchedPair:
     Attributes:
         one, two: positions of the photographs in the list.
         xy_one, xy_two: (M, 2) pixels of the stored photographs.
-        motion: median distance between the two pixels of a match, as an angle in degrees of a
+        motion: The median distance between the two pixels of a match, as an angle in degrees of a
             camera with a nominal focal length (of a panorama, of its own).
-        found: number of verified matches, of which ``MAX_USED`` are kept.
+        found: The number of verified matches, of which ``MAX_USED`` are kept.
     """
 
     one: int
@@ -84,11 +84,11 @@ class PairFinder:
     """Finds pairs of photographs with matches.
 
     Args:
-        photos: photographs in the order of their names.
+        photos: Photographs in the order of their names.
         cameras: their given cameras, which may be wrong.
         centres: (K, N, 3) positions of the photographs according to K readings of the poses, of
             which near ones are tried if the neighbours in the order of names do not match.
-        matcher: the source of matches.
+        matcher: The source of matches.
     """
 
     def __init__(

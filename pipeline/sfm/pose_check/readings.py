@@ -47,7 +47,7 @@ def readings(given: PoseSet, kind: PoseKind, names: Sequence[str]) -> Iterator[R
     """All other readings of poses that were read as of ``kind``.
 
     Args:
-        names: the photographs in the order of ``given``.
+        names: The photographs in the order of ``given``.
     """
     convention = CONVENTIONS[kind]
     simple = [

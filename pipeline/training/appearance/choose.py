@@ -29,9 +29,9 @@ class AppearanceChoice:
     """How the colours of photographs differ.
 
     Attributes:
-        gains: exposure gains of all views; empty if exposure is not modelled.
-        embeddings: whether views have appearance embeddings.
-        decisions: sentences for the user.
+        gains: Exposure gains of all views; empty if exposure is not modelled.
+        embeddings: Whether views have appearance embeddings.
+        decisions: Sentences for the user.
         counters: what was measured, by the name of its counter.
     """
 
@@ -54,12 +54,12 @@ def choose_appearance(
     """Choose the model of appearance that ``wanted`` names, or by measurement.
 
     Args:
-        views: all views.
+        views: All views.
         points: (N, 3) of the scene, for a model without points.
         wanted: The option ``train.appearance``.
-        cameras: camera group of each photograph.
-        has_alpha: whether photographs have alpha: exposure is not modelled.
-        in_blocks: whether the scene is trained in blocks: ``measured`` chooses no embeddings.
+        cameras: The camera group of each photograph.
+        has_alpha: Whether photographs have alpha: exposure is not modelled.
+        in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
     choice = AppearanceChoice(embeddings=wanted == "embedding")
     if wanted in ("none", "embedding") or has_alpha:

@@ -95,7 +95,7 @@ class AppearanceEmbeddings:
         Args:
             d_colors: (N, 3) gradient of the colours (``Gradients.colors``).
             moments, rates: The state and the rates of Adam for ``gaussians.appearance``.
-            rate: learning rate of the embedding, as a share of ``MAX_CHANGE``.
+            rate: The learning rate of the embedding, as a share of ``MAX_CHANGE``.
         """
         assert gaussians.appearance is not None
         d_embedding, d_appearance = appearance_gradients(

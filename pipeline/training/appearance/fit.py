@@ -41,7 +41,7 @@ def in_photograph(
 
     Args:
         gaussians: of the scene.
-        photo, mask: see ``fit_embedding``; the mask is False for ignored pixels.
+        photo, mask: See ``fit_embedding``; the mask is False for ignored pixels.
     """
     gaussians = replace(gaussians, appearance=torch.from_numpy(appearance.colors))
     embedding = appearance.embeddings.get(view.name)

@@ -33,8 +33,8 @@ class BlockLayers:
     view at a time: each render needs as much memory as all Gaussians.
 
     Attributes:
-        coarse: the Gaussians of the whole scene before the blocks are trained.
-        partition, number: the block.
+        coarse: The Gaussians of the whole scene before the blocks are trained.
+        partition, number: The block.
         corrects: what explains the part of an error that the block is to correct.
         background: behind the scene.
         options: as in training, without a background.

@@ -56,13 +56,13 @@ class PartitionOptions:
     """What a partition depends on besides the coarse Gaussians and the views.
 
     Attributes:
-        blocks: number of blocks.
+        blocks: The number of blocks.
         axes: (3, 3) float64, directions of the faces as rows, orthonormal.
-        max_gaussians: upper limit of the number of Gaussians of a block that fills its views.
-        view_pixels: number of pixels of a typical view.
-        pixels_per_gaussian: training pixels of all views together for a Gaussian.
+        max_gaussians: The upper limit of the number of Gaussians of a block that fills its views.
+        view_pixels: The number of pixels of a typical view.
+        pixels_per_gaussian: Training pixels of all views together for a Gaussian.
         steps: of one block for the whole scene.
-        raster: options of rendering, with near plane and antialiasing of the training.
+        raster: Options of rendering, with near plane and antialiasing of the training.
     """
 
     blocks: int
@@ -95,8 +95,8 @@ def partition_scene(
     """The partition of a scene, with horizontal and vertical faces.
 
     Args:
-        coarse: the Gaussians of the whole scene.
-        views: all views, sorted by name.
+        coarse: The Gaussians of the whole scene.
+        views: All views, sorted by name.
     """
     training = [view for view in views if not view.is_test]
     sizes = Counter(view.width * view.height for view in training)
@@ -136,8 +136,8 @@ def make_partition(
     """Divide the scene and choose the views of each block.
 
     Args:
-        coarse: the Gaussians of the whole scene.
-        views: the training views, sorted by name.
+        coarse: The Gaussians of the whole scene.
+        views: The training views, sorted by name.
     """
     grey = in_grey(coarse)
     raster = replace(options.raster, sh_degree=0, background=None)

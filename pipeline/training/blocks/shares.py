@@ -32,7 +32,7 @@ def explained_shares(
     and a render of all Gaussians, for its depths.
 
     Args:
-        grey: all Gaussians, of SH degree 0.
+        grey: All Gaussians, of SH degree 0.
         regions: (N,) bool each, at least one.
         options: of SH degree 0 and without a background.
     """

@@ -28,7 +28,7 @@ class IntrinsicsRefinement:
     Attributes:
         ids: (C,) ids of the cameras, ascending.
         camera_of: (V,) index of each view's camera in ``ids``.
-        limit: upper limit of the total change, in focal lengths.
+        limit: The upper limit of the total change, in focal lengths.
         change: (C, 3) logarithm of the factor of both focal lengths, and the shift of the principal
             point in x and y, in units of the given focal length in x: independent of the size of
             the image.
@@ -67,8 +67,8 @@ class IntrinsicsRefinement:
         """Refine the camera of a view.
 
         Args:
-            camera: the refined camera that the view was rendered with.
-            rate: learning rate, in focal lengths.
+            camera: The refined camera that the view was rendered with.
+            rate: The learning rate, in focal lengths.
         """
         own = int(self.camera_of[index])
         d_fx, d_fy = gradients.focal.tolist()

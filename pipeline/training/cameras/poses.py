@@ -32,8 +32,8 @@ class PoseRefinement:
     Attributes:
         poses: (V, 4, 4) world to camera.
         pivots: (V,) depth of the centre of rotation in the camera's frame, world units.
-        extent: unit of translations (``scene.views.scene_extent``), world units.
-        limit: upper limit of a pose's total change, in radians and extents.
+        extent: The unit of translations (``scene.views.scene_extent``), world units.
+        limit: The upper limit of a pose's total change, in radians and extents.
         adam: (V, 6) moments of the rotation (radians) and the translation (extents).
     """
 

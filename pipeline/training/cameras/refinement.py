@@ -21,7 +21,7 @@ class CameraRefinement:
     """The refined cameras of the training views.
 
     Attributes:
-        num_views: number of training views.
+        num_views: The number of training views.
         poses: None if poses are not refined.
         intrinsics: None if intrinsics are not refined.
     """
@@ -70,8 +70,8 @@ class CameraRefinement:
         """Refine the camera of a view.
 
         Args:
-            camera: the refined camera that the view was rendered with.
-            rate: learning rate of parameters that this share of the steps changes, relative to
+            camera: The refined camera that the view was rendered with.
+            rate: The learning rate of parameters that this share of the steps changes, relative to
                 the upper limit of their total change (``Schedule.camera_rate``).
         """
         if self.poses is not None:

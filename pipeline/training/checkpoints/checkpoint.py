@@ -33,9 +33,9 @@ class Checkpoint:
 
     Attributes:
         step: steps done.
-        identity: digest of the run's inputs and options.
+        identity: The digest of the run's inputs and options.
         arrays: by name.
-        values: the rest of the state, as JSON.
+        values: The rest of the state, as JSON.
     """
 
     step: int

@@ -57,7 +57,7 @@ def check_position(values: Mapping[str, Any], views: int) -> None:
     """Check the position in the schedule.
 
     Args:
-        views: the number of training views.
+        views: The number of training views.
 
     Raises:
         ValueError: it is not one of a run with these views.

@@ -40,7 +40,7 @@ class Fit:
 
     Attributes:
         kind: "factor": z = a v; "depth": z = a v + b; "inverse": 1 / z = a v + b.
-        error: median of |log(z / known z)| over the points.
+        error: The median of |log(z / known z)| over the points.
     """
 
     kind: str
@@ -80,7 +80,7 @@ def map_depths(
     """Samples of the depth map ``path`` of ``view``, fitted to the depths of its ``points``.
 
     Args:
-        digest: the file's recorded digest.
+        digest: The file's recorded digest.
 
     Returns:
         the samples, each of weight 1, and the fit; None if the map does not fit the points.
@@ -133,7 +133,7 @@ def add_maps(
 
     Args:
         maps: each view's file and its recorded digest; None for a view without a depth map.
-        fitted_to: the depths that maps are fitted to: ``points``, or others if there are none.
+        fitted_to: The depths that maps are fitted to: ``points``, or others if there are none.
 
     Returns:
         known depths by view; the number of maps by kind of fit; names of views whose maps do not

@@ -19,11 +19,11 @@ class Inputs:
     """A scene before training.
 
     Attributes:
-        views: the training views.
-        initial: the initial Gaussians.
+        views: The training views.
+        initial: The initial Gaussians.
         extent: ``scene.views.scene_extent``, world units: determines the near plane and is the unit
             of camera refinement.
-        scale: unit of the means' learning rate and of the sizes of Gaussians, world units
+        scale: The unit of the means' learning rate and of the sizes of Gaussians, world units
             (``training.data.known_depths.scene_scale``); None: the extent.
         gains: (V, 3) brightness of each photograph relative to the scene's typical one
             (``photos.exposure``), by which renders are multiplied before the loss. Only for views
@@ -33,7 +33,7 @@ class Inputs:
         depths: known depths of each view for the depth loss (``training.losses.depth``).
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
-        seen_share: mean share of the views that see a Gaussian (``scene.visibility``).
+        seen_share: The mean share of the views that see a Gaussian (``scene.visibility``).
         open_layers: for a block of a scene, makes the source of the layers around it in each view,
             which renders with so many threads and is not held during training; None: the Gaussians
             are the whole scene.

@@ -31,7 +31,7 @@ class Target:
         rgb: (H, W, 3) uint8, multiplied by alpha; 0 where ignored.
         alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
         ignored: (H, W) bool, True for ignored pixels, or None if there are none.
-        surroundings: the layers around a block, or None if the whole scene is trained.
+        surroundings: The layers around a block, or None if the whole scene is trained.
         is_overview: of a block: the block is in the ignored pixels, and trained in another view.
     """
 
@@ -68,7 +68,7 @@ class Layers:
     """A view of a scene of which one block is trained.
 
     Attributes:
-        surroundings: the layers around the block.
+        surroundings: The layers around the block.
         weight: (H, W) float32, the part of the scene's error that the block is to correct; other
             blocks correct the rest.
         coarse: (H, W, 3) uint8, the scene before training with the view's exposure.

@@ -35,9 +35,9 @@ class Timeline:
     """The steps after which a strategy changes the set of Gaussians.
 
     Attributes:
-        start, stop: first and last step of densification.
+        start, stop: The first and last step of densification.
         interval: steps between densifications, and afterwards between prunings.
-        prune_stop: last step of pruning.
+        prune_stop: The last step of pruning.
     """
 
     start: int

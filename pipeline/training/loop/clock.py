@@ -11,9 +11,9 @@ class Clock:
     the time that has passed.
 
     Args:
-        steps: length of the schedule.
-        minutes: the time budget; None for a run of ``steps`` optimiser steps.
-        part: first step of the schedule, counted from 0, and the step after the last.
+        steps: The length of the schedule.
+        minutes: The time budget; None for a run of ``steps`` optimiser steps.
+        part: The first step of the schedule, counted from 0, and the step after the last.
     """
 
     def __init__(self, steps: int, minutes: float | None, part: range):

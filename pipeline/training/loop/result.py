@@ -23,13 +23,13 @@ class TrainResult:
     Attributes:
         gaussians: with SH of the configured degree, in the colours of the mean photograph.
         curve: deterministic.
-        curve_seconds: training time of each record; differs between runs.
-        counters: totals of the run (``state.Counters``).
-        near: near plane of the training, world units; renders need the same.
+        curve_seconds: The training time of each record; differs between runs.
+        counters: The totals of the run (``state.Counters``).
+        near: The near plane of the training, world units; renders need the same.
         background: of the training: black, white or random.
         warnings: for the user; deterministic.
-        steps: number of optimiser steps.
-        seconds: training time in all processes of the run.
+        steps: The number of optimiser steps.
+        seconds: The training time in all processes of the run.
         built: ``Backend.facts`` of the last process.
         poses: (4, 4) refined world to camera of each view by name, or None.
         intrinsics: (3,) change of each camera's intrinsics by id

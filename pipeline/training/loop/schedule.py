@@ -96,8 +96,8 @@ class Schedule:
         """The learning rates of a step.
 
         Args:
-            warm_up: factor of all of them.
-            run_length: number of optimiser steps of the whole run, or its estimate.
+            warm_up: The factor of all of them.
+            run_length: The number of optimiser steps of the whole run, or its estimate.
             unit: of the means' learning rate, world units; 1 for each Gaussian's own scales.
         """
         rates = self.options.experiments

@@ -39,10 +39,10 @@ class TrainingScene:
 
     Attributes:
         inputs: without views that their masks hide completely.
-        targets: pixels of ``inputs.views``.
+        targets: The pixels of ``inputs.views``.
         gains: (V, 3) float32 factors of the renders, or None.
         background: black, white or random.
-        near: near plane, world units.
+        near: The near plane, world units.
         sky: None without a skybox.
     """
 

@@ -28,8 +28,8 @@ class Counters:
 
     Attributes:
         changes: of density control.
-        opacity_resets: number of opacity resets.
-        max_gaussians: the largest number of Gaussians.
+        opacity_resets: The number of opacity resets.
+        max_gaussians: The largest number of Gaussians.
         num_dropped: Gaussians that the rasterizer left out for numerical reasons, over all steps.
         blind_steps: steps whose view saw no Gaussian.
         unseen: Gaussians removed at the end because no training view saw them.
@@ -60,11 +60,11 @@ class TrainState:
     """The state after ``step`` steps.
 
     Attributes:
-        clock: position in the schedule: ``step``, or less or more with a time budget.
+        clock: The position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
-        appearance: the embeddings of the views; None if appearance is not modelled.
-        curve: records without times; ``curve_seconds`` has the time of each.
-        seconds: training time so far, in all processes.
+        appearance: The embeddings of the views; None if appearance is not modelled.
+        curve: Records without times; ``curve_seconds`` has the time of each.
+        seconds: The training time so far, in all processes.
     """
 
     gaussians: Gaussians

@@ -18,8 +18,8 @@ class StepTimeEstimator:
     """The estimate of one process; a resumed run measures again.
 
     Attributes:
-        budget: seconds of the whole run.
-        step_seconds: time of a step at full resolution; 0 before the first measurement.
+        budget: The seconds of the whole run.
+        step_seconds: The time of a step at full resolution; 0 before the first measurement.
         started: step, seconds and resolution factor at the start of the current measurement.
     """
 

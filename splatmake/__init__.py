@@ -103,7 +103,7 @@ class Scene:
         """The view with this name, which may omit the suffix.
 
         Raises:
-            UserError: there is none.
+            UserError: There is no such view.
         """
         return choose_views(self.views, [name], Path(name))[0]
 
@@ -119,7 +119,7 @@ class Scene:
         """The photograph of a view at the view's size, (H, W, 3) float32 in [0, 1].
 
         Raises:
-            UserError: its file is missing or cannot be read.
+            UserError: The photograph's file is missing or cannot be read.
         """
         pixels = load_view(view)
         return pixels.over(self._protocol.background).astype(np.float32) / np.float32(255)
@@ -128,7 +128,8 @@ class Scene:
         """Render views and compare them with their photographs, with the protocol of metrics.json.
 
         Args:
-            views: those to measure; empty: the test views, or all views if there are no test views.
+            views: The views to measure; empty: the test views, or all views if there are no test
+                views.
 
         Raises:
             UserError: a photograph that cannot be read, or masks that leave no pixel.
@@ -169,7 +170,7 @@ def load(
         model: The file of Gaussians; None: those of the finished scene.
         max_side: The longer side to which larger views are reduced, in pixels; None: as in the
             finished scene, else full size.
-        threads: threads for rendering; None: one per core.
+        threads: The number of threads for rendering; None: one per core.
 
     Raises:
         UserError: a scene or a file that is missing, unfinished or cannot be read.
@@ -194,7 +195,7 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
     """Read Gaussians from a .ply, .spz, .splat, .glb or .npz file.
 
     Raises:
-        UserError: an unknown suffix, or a file that cannot be read.
+        UserError: An unknown suffix, or a file that cannot be read.
     """
     found: list[str] = []
     gaussians = splat_files.read_gaussians(Path(file), found)
@@ -207,7 +208,7 @@ def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
     hold.
 
     Raises:
-        UserError: an unknown suffix, or Gaussians that the format cannot hold.
+        UserError: An unknown suffix, or Gaussians that the format cannot hold.
     """
     _warn(splat_files.write_gaussians(Path(file), gaussians))
 

@@ -41,7 +41,7 @@ def holes(probe: ProbeView, observed: Observations, opaque: Bools | None) -> Boo
     """(H, W) pixels whose ray meets no surface although one is there.
 
     Args:
-        observed: of the points of the probe view.
+        observed: The visibility of the probe view's points.
         opaque: (H, W) opaque pixels of the photograph, if it has an alpha channel: these show a
             surface. Without (None), pixels are holes unless ``MIN_AGREEING`` photographs show
             background there as well.
@@ -55,7 +55,7 @@ def floating(probe: ProbeView, observed: Observations, nearest: float) -> Bools:
     and that as many see past or that is nearer than any certain surface.
 
     Args:
-        observed: of the points of the probe view.
+        observed: The visibility of the probe view's points.
         nearest: The distance of the nearest certain surfaces, world units.
     """
     shape = probe.empty.shape
@@ -71,7 +71,7 @@ def near_floaters(
     ``MIN_AGREEING`` training views show.
 
     Args:
-        nearest: as for ``floating``.
+        nearest: The same as for ``floating``.
     """
     from scipy.spatial import cKDTree
 

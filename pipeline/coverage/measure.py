@@ -78,7 +78,7 @@ class MeasuredView:
         trust: (H, W), in [0, 1].
         squared_error: (H, W) mean over the channels, for colours in [0, 1].
         measured: (H, W) True in the pixels that are measured.
-        record: its entry in ``coverage.json``.
+        record: The entry in ``coverage.json``.
     """
 
     probe: ProbeView
@@ -102,8 +102,8 @@ class WorldFrame:
     Attributes:
         up: (3,) unit vector.
         unit: The name of the unit of length; None if the scale is arbitrary.
-        normalization: from the world of the given poses, in which results are recorded, to that
-            of the views.
+        normalization: The transform from the world of the given poses, in which results are
+            recorded, to that of the views.
     """
 
     up: Doubles

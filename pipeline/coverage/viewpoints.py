@@ -57,7 +57,7 @@ class Viewpoint:
     Attributes:
         view: The camera, at the size of the photographs.
         subject: (3,) world point on its optical axis.
-        distance: from the camera to the subject, world units.
+        distance: The distance from the camera to the subject, world units.
     """
 
     view: View
@@ -87,7 +87,7 @@ class NextBestViews:
     """Proposals and what they were chosen from.
 
     Attributes:
-        proposals: in the order in which they were chosen.
+        proposals: The proposals in the order in which they were chosen.
         candidates: All viewpoints that were evaluated.
         trust_before, trust_after: The mean trust over the candidates without and with the
             proposals.

@@ -56,7 +56,7 @@ class Camera:
 
     Attributes:
         model: A key of ``CAMERA_MODELS``.
-        width, height: The pixels.
+        width, height: The image size in pixels.
         params: (K,) float64 in the model's order; focal lengths and principal point in pixels,
             distortion coefficients for normalised coordinates.
     """

@@ -32,7 +32,7 @@ class LensModel:
     """A lens model; the last argument of each function is the (K,) distortion coefficients.
 
     Attributes:
-        distort: normalised coordinates to those of the image.
+        distort: The function from normalised coordinates to those of the image.
         undistort: The inverse; NaN without one.
         fold_radius: The largest undistorted radius up to which the distorted one increases.
     """

@@ -70,10 +70,10 @@ class Uncertainty(NamedTuple):
     """Standard deviations of a fitted similarity.
 
     Attributes:
-        scale: relative to the scale.
-        heading: radians, about the vertical axis.
-        tilt: radians, about the horizontal axis that is determined worst, by the points of which
-            all coordinates were measured.
+        scale: The error of the scale, relative to it.
+        heading: The angle in radians about the vertical axis.
+        tilt: The angle in radians about the horizontal axis that is determined worst, by the points
+            of which all coordinates were measured.
     """
 
     scale: float
@@ -85,7 +85,7 @@ class RobustFit(NamedTuple):
     """A similarity estimated in the presence of outliers.
 
     Attributes:
-        similarity: maps source points to target points.
+        similarity: The transform from source points to target points.
         inliers: (N,) bool, the points that it was fitted to.
         sigma: The standard deviation of the weighted residuals along one axis of the ground plane,
             in the target's unit.

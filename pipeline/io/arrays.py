@@ -55,7 +55,8 @@ def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]
     """The shape, whether the first axis varies fastest, and the type of a ``.npy`` file's array.
 
     Raises:
-        Exception: numpy parses the header as Python source, with exceptions of many types.
+        Exception: The header is invalid; numpy parses the header as Python source, with exceptions
+            of many types.
     """
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     shape, fortran, dtype = read[npy.read_magic(file)](file)
@@ -66,7 +67,7 @@ def read_array(data: bytes) -> NDArray:
     """The array of a ``.npy`` file: integers, floats or bools.
 
     Raises:
-        ValueError: not such a file, or its size differs from its header's.
+        ValueError: The file is not of this kind, or its size differs from its header's.
     """
     return _read_array(io.BytesIO(data), len(data))
 
@@ -97,7 +98,7 @@ def read_archive(file: BinaryIO) -> dict[str, NDArray]:
     """The arrays of a ``.npz`` file by name, in the file's order.
 
     Raises:
-        ValueError: not such a file, or one that would expand to many times its size.
+        ValueError: The file is not of this kind, or one that would expand to many times its size.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)

@@ -22,7 +22,7 @@ def opened_regular(path: Path) -> Iterator[BufferedReader]:
     """An open regular file.
 
     Raises:
-        OSError: it cannot be opened, or is a device or a pipe, which may have no end.
+        OSError: The file cannot be opened, or is a device or a pipe, which may have no end.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
@@ -40,7 +40,7 @@ def opened_bounded(path: Path, limit: int | None = None, *, fix: str) -> Iterato
         fix: What to do about a file that cannot be read.
 
     Raises:
-        UserError: it cannot be read, is a device or a pipe, or is larger than ``limit``.
+        UserError: The file cannot be read, is a device or a pipe, or is larger than ``limit``.
     """
     largest = usable_memory() // 2 if limit is None else limit
     try:
@@ -66,7 +66,7 @@ def read_text(path: Path, limit: int, *, fix: str) -> str:
     write.
 
     Raises:
-        UserError: as ``read_bounded``, or other bytes.
+        UserError: See ``read_bounded``; or the text has other bytes.
     """
     data = read_bounded(path, limit, fix=fix)
     try:

@@ -19,7 +19,8 @@ def parse_xml(data: bytes) -> Element:
     """The root element; namespaces become "{address}name" (``ElementTree``).
 
     Raises:
-        ValueError: not well-formed, nested too deeply, too large, or with a document type.
+        ValueError: The XML is not well-formed, nested too deeply, too large, or with a document
+            type.
     """
     needed = data.count(b"<") * _TAG_BYTES + data.count(b"=") * _ATTRIBUTE_BYTES
     if needed > _MAX_MEMORY:

@@ -28,13 +28,13 @@ def read_cameras(path: Path, *, exported: bool = False) -> Reconstruction:
     Cameras of an export folder are returned in the world of the Gaussians there.
 
     Args:
-        exported: for a results' folder, whether the model is an exported file: in the unit of the
+        exported: Whether, for a results' folder, the model is an exported file: in the unit of the
             given poses. Otherwise the cameras are in the world that the scene was trained in.
         path: The folder of a COLMAP model, a scene's or results' folder with a model in
             ``sparse/0``, or a ``transforms.json`` or its folder.
 
     Raises:
-        UserError: no cameras found, or malformed files.
+        UserError: No cameras were found, or files are malformed.
     """
     is_results = (path / "plan.json").is_file()
     roots = [path / name for name in STAGES_WITH_MODEL] if is_results else [path]
@@ -81,7 +81,7 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
         source: The file or folder of the views, for error messages.
 
     Raises:
-        UserError: no view has one of the names, or several have it.
+        UserError: No view has one of the names, or several have it.
     """
     by_name = {view.name: view for view in views}
     index = NameIndex(by_name)

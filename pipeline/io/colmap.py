@@ -42,7 +42,7 @@ def read_model(folder: Path, *, points: bool = True) -> Reconstruction:
         points: Whether to read the points, which take most of the memory and time.
 
     Raises:
-        UserError: no model, malformed or truncated files, unknown camera models, poses or
+        UserError: No model, malformed or truncated files, unknown camera models, poses or
             intrinsics that are not finite, images of unknown cameras, tracks of unknown images.
     """
     files = model_files(folder)
@@ -73,7 +73,7 @@ def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> N
     names with spaces.
 
     Raises:
-        ValueError: an image name that the format cannot hold.
+        ValueError: An image name that the format cannot hold.
     """
     form, suffix = (colmap_text, ".txt") if text else (colmap_binary, ".bin")
     keypoints, tracks = _index_tracks(model)

@@ -48,8 +48,8 @@ def read_header(file: IO[bytes]) -> ExrHeader:
     """The header of a file with colours in R, G, B or with luminance in Y.
 
     Raises:
-        ValueError: not an OpenEXR file, or one without such channels; a crop of a larger image; or
-            an impossible size.
+        ValueError: The file is not OpenEXR, or one without such channels; a crop of a larger image;
+            or an impossible size.
     """
     opened = _open(file, header_only=True)
     header = opened.header()
@@ -96,7 +96,7 @@ def read_pixels(file: IO[bytes]) -> tuple[NDArray[np.float32], NDArray[np.float3
     """(H, W, 3) linear sRGB, multiplied by alpha as stored, and (H, W) alpha or None.
 
     Raises:
-        ValueError: as ``read_header``, or the pixels are damaged.
+        ValueError: See ``read_header``; or the pixels are damaged.
     """
     found = read_header(file)
     file.seek(0)
@@ -118,7 +118,7 @@ def _to_srgb(values: Sequence[float]) -> NDArray[np.float64] | None:
     """The matrix for the attribute ``chromaticities``: x and y of red, green, blue and white.
 
     Raises:
-        ValueError: no colours have these chromaticities.
+        ValueError: No colours have these chromaticities.
     """
     numbers = [float(value) for value in values]
     if len(numbers) != 8:

@@ -49,7 +49,7 @@ def pictures_in(folder: Path, *, recursive: bool = True) -> list[str]:
 
     Raises:
         OSError: ``folder`` cannot be read.
-        TooManyFilesError: see ``walk``.
+        TooManyFilesError: See ``walk``.
     """
     return _files_in(folder, recursive, lambda name: suffix_of(name) in PHOTO_SUFFIXES)
 

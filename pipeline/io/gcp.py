@@ -44,9 +44,9 @@ class GroundPoint:
 
     Attributes:
         name: The name in the file, else "gcp1" and so on in the file's order.
-        position: x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
+        position: The x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
             z in metres.
-        pixels: The photograph's name -> pixel, COLMAP's convention (the first pixel's centre is
+        pixels: The pixel by the photograph's name, COLMAP's convention (the first pixel's centre is
             0.5).
     """
 
@@ -81,7 +81,7 @@ def ground_control_file(folder: Path) -> Path | None:
     """The folder's ``gcp_list.txt`` in any case; None without one.
 
     Raises:
-        UserError: there are two.
+        UserError: There are two such files.
     """
     found = sorted(
         path for path in folder.iterdir() if path.name.casefold() == GCP_FILE and path.is_file()
@@ -113,7 +113,7 @@ def read_ground_control(
     """Read ``gcp_list.txt``.
 
     Args:
-        sizes: Photographs of the scene -> width and height. Names match as in ``NameIndex``.
+        sizes: The width and height by photograph of the scene. Names match as in ``NameIndex``.
         complete: Whether these are all photographs; False if frames of videos will follow.
 
     Raises:
@@ -290,7 +290,7 @@ def _check_coordinates(path: Path, projection: Projection, rows: list[_Row]) -> 
     """Check that the coordinates are possible in the projection.
 
     Raises:
-        UserError: they are not, with the order if they are in the other one.
+        UserError: The coordinates are not valid; the message names the order if it is swapped.
     """
     written = np.array([row.position for row in rows])
     swapped = written[:, [1, 0, 2]]

@@ -42,7 +42,7 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
     """Write a .glb file atomically.
 
     Raises:
-        UserError: no Gaussians, or more than the format's limit of 4 GiB.
+        UserError: There are no Gaussians, or more than the format's limit of 4 GiB.
     """
     count = len(gaussians)
     if not 0 < count * (192 + 48) < 2**32 - 2**20:

@@ -56,7 +56,7 @@ def matrix_of(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """(3, 3) linear RGB with these primaries to CIE XYZ, adapted to a white of D50 (Bradford).
 
     Raises:
-        ValueError: no colours have these chromaticities.
+        ValueError: No colours have these chromaticities.
     """
     xy = np.array(chromaticities, np.float64)
     if xy.shape != (4, 2) or not np.isfinite(xy).all() or np.abs(xy[:, 1]).min() < 1e-3:
@@ -77,7 +77,7 @@ def write_profile(name: str, chromaticities: Chromaticities, curve: Curve) -> by
     """An ICC profile (version 4) of a display with these primaries and one curve.
 
     Raises:
-        ValueError: as ``matrix_of``.
+        ValueError: See ``matrix_of``.
     """
     matrix = matrix_of(chromaticities)
     kind = _PARAMETERS.index(len(curve))

@@ -35,8 +35,8 @@ def read_poses_bounds(path: Path, names: Sequence[str]) -> Reconstruction:
         SIMPLE_PINHOLE cameras of the file's size, no points.
 
     Raises:
-        UserError: not a ``poses_bounds.npy``, another number of rows than photographs, values
-            that are not finite, a matrix that is not a rotation.
+        UserError: The file is not a ``poses_bounds.npy``, another number of rows than photographs,
+            values that are not finite, a matrix that is not a rotation.
     """
     rows = read_rows(path)
     if len(rows) != len(names):
@@ -73,7 +73,7 @@ def read_rows(path: Path) -> NDArray[np.float64]:
     """The file's (N, 17) finite numbers.
 
     Raises:
-        UserError: not a ``poses_bounds.npy``, or values that are not finite.
+        UserError: The file is not a ``poses_bounds.npy``, or values that are not finite.
     """
     try:
         rows = np.asarray(read_array(read_bounded(path, _MAX_BYTES, fix=_FIX)), np.float64)

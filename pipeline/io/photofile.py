@@ -147,8 +147,8 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
         name: The name of the file; its suffix decides which formats are tried.
 
     Raises:
-        OSError: no image of these formats.
-        ValueError: too many pixels; PIL's exceptions of any type for damaged files.
+        OSError: The file is no image of these formats.
+        ValueError: The image has too many pixels; PIL's exceptions of any type for damaged files.
     """
     pillow_formats.register(suffix_of(name))
     image = Image.open(file, formats=_formats(name))

@@ -41,7 +41,7 @@ class _Stored:
 
     Attributes:
         picture: The pixels in OpenCV's layout; (H, W, 4) CMYK if ``cmyk``.
-        colours: what the file says about them.
+        colours: The file's description of its colours.
     """
 
     picture: Picture
@@ -58,7 +58,7 @@ def decode_photograph(data: bytes, name: str) -> Picture:
         name: The name of the file; its suffix decides which formats are tried.
 
     Raises:
-        ValueError: no picture that can be decoded, with the reason.
+        ValueError: The picture cannot be decoded; the message has the reason.
     """
     stored = _decoded(data, name)
     if not stored.cmyk and stored.colours.profile is None:
@@ -77,7 +77,7 @@ def decode_mask(data: bytes, name: str) -> MaskPixels:
     """Decode a mask.
 
     Raises:
-        ValueError: as ``decode_photograph``.
+        ValueError: See ``decode_photograph``.
     """
     stored = _decoded(data, name)
     picture = stored.picture
@@ -90,7 +90,7 @@ def decode_depth(data: bytes) -> Picture | None:
     """Decode a depth map (PNG or TIFF) as stored; None if that is not possible.
 
     Raises:
-        ValueError: it is truncated, or has more pixels than photographs have.
+        ValueError: The picture is truncated, or has more pixels than photographs have.
     """
     if _is_truncated(data):
         raise ValueError(TRUNCATED)

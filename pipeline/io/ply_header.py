@@ -52,7 +52,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     """Read the header of a PLY file, up to the first byte of its body.
 
     Raises:
-        UserError: it is not a PLY file whose first element is ``vertex``.
+        UserError: The file is not a PLY file whose first element is ``vertex``.
     """
     lines: list[list[str]] = []
     size = 0

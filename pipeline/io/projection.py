@@ -126,7 +126,8 @@ def read_projection(text: str) -> Projection:
     """The projection that a user wrote.
 
     Raises:
-        ValueError: it is unknown, or of a kind that coordinates in metres or degrees do not have.
+        ValueError: The projection is unknown, or of a kind that coordinates in metres or degrees do
+            not have.
     """
     from pyproj import CRS
     from pyproj.exceptions import ProjError
@@ -178,7 +179,7 @@ def _standard(text: str) -> str:
     """OpenDroneMap's names of UTM zones as EPSG codes; other texts unchanged.
 
     Raises:
-        ValueError: no text for PROJ, or no such zone.
+        ValueError: The text is not PROJ's, or there is no such zone.
     """
     if not text or len(text) > _MAX_LENGTH or "\0" in text:
         raise ValueError(f"expected a projection, found: {shortened(text)}")

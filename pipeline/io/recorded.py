@@ -18,7 +18,7 @@ def digest_of(path: Path) -> str:
     """Hex digest of a file's bytes.
 
     Raises:
-        OSError: it cannot be read, or is not a regular file.
+        OSError: The file cannot be read, or is not a regular file.
     """
     with opened_regular(path) as file:
         return hashlib.file_digest(file, _hash).hexdigest()

@@ -46,7 +46,7 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     not read of the format (``splat_losses``).
 
     Raises:
-        UserError: an unknown suffix, a file that cannot be read, or no valid Gaussians.
+        UserError: An unknown suffix, a file that cannot be read, or no valid Gaussians.
     """
     read, _ = _format_of(path)
     gaussians = read(path)
@@ -86,7 +86,7 @@ def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = 
         A sentence for everything that the format does not hold (``splat_losses``).
 
     Raises:
-        UserError: an unknown suffix, or Gaussians that the format cannot hold.
+        UserError: An unknown suffix, or Gaussians that the format cannot hold.
     """
     _, write = _format_of(path)
     if write is write_spz:

@@ -108,7 +108,7 @@ def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:
             with which viewers should render them.
 
     Raises:
-        UserError: more than ``MAX_GAUSSIANS``.
+        UserError: There are more than ``MAX_GAUSSIANS``.
     """
     return b"".join(_compressed(_sections(gaussians, antialias)))
 
@@ -183,7 +183,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
         file: The file that error messages name.
 
     Raises:
-        UserError: not an SPZ file, another version, truncated, or inconsistent with its header.
+        UserError: The file is not SPZ, another version, truncated, or inconsistent with its header.
     """
 
     def wrong(what: str) -> UserError:

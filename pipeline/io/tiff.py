@@ -54,7 +54,7 @@ def layout_of(data: bytes) -> TiffLayout:
     """The layout of a TIFF file's first image.
 
     Raises:
-        ValueError: its first directory is damaged.
+        ValueError: The file's first directory is damaged.
     """
     tags = {tag: values for tag, (_, values) in _directory(data).items()}
 

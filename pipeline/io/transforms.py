@@ -181,7 +181,7 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
             files of several splits may list the same frames.
 
     Raises:
-        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses,
+        UserError: No file, malformed JSON, missing fields, matrices that are not finite poses,
             camera models that are not supported, a path with two poses.
     """
     files = [path] if path.is_file() else find_transforms(path)
@@ -219,7 +219,7 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
         Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
 
     Raises:
-        UserError: as ``read_frames``, and for intrinsics that are missing or impossible.
+        UserError: See ``read_frames``; or intrinsics are missing or impossible.
     """
     return reconstruct(read_frames(path), sizes, path)
 
@@ -242,7 +242,7 @@ def read_points_entry(path: Path) -> PointsEntry:
     """The point cloud of a pose file, or of the files in a scene folder.
 
     Raises:
-        UserError: as ``read_frames``.
+        UserError: See ``read_frames``.
     """
     frames = read_frames(path)
     if not frames:

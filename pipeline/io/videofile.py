@@ -70,7 +70,7 @@ def read_video_facts(path: Path) -> VideoFacts:
     """Read a video's header.
 
     Raises:
-        UserError: not a regular file, or not a video in a supported format.
+        UserError: The file is not a regular file, or not a video in a supported format.
     """
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise UserError("cannot be read as a video: not a regular file", file=path, fix=FIX)

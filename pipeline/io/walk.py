@@ -57,7 +57,7 @@ def walk(
 
     Raises:
         OSError: ``root`` cannot be read.
-        TooManyFilesError: more than ``MAX_ENTRIES`` files and folders.
+        TooManyFilesError: There are more than ``MAX_ENTRIES`` files and folders.
     """
     top = os.path.realpath(root)
     seen: set[str] = set()

@@ -79,11 +79,11 @@ def evaluate_views(
     """Render each view, write it as 8-bit PNG, and compare that image with the photograph.
 
     Args:
-        gains: of all views of the protocol, by which renders are multiplied; empty if exposure is
-            not modelled.
-        appearance: of the Gaussians in photographs; None if it is not modelled. Views without an
-            embedding of their own get one that is fitted on their left half, and are measured on
-            the right half.
+        gains: The exposure gains of all views of the protocol, by which renders are multiplied;
+            empty if exposure is not modelled.
+        appearance: The appearance of the Gaussians in photographs; None if it is not modelled.
+            Views without an embedding of their own get one that is fitted on their left half, and
+            are measured on the right half.
         out: The folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:

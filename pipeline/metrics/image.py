@@ -45,7 +45,7 @@ def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
         ``min(-10 log10(mean squared error), PSNR_CAP)``.
 
     Raises:
-        UserError: no pixel is unmasked.
+        UserError: No pixel is unmasked.
     """
     keep = _checked(image, reference, mask)
     squared = np.empty(image.shape)
@@ -72,7 +72,7 @@ def ssim(
             averages only the pixels whose window lies inside the image.
 
     Raises:
-        UserError: no pixel is left to average, or a side is under 11 pixels with "valid".
+        UserError: No pixel is left to average, or a side is under 11 pixels with "valid".
     """
     keep = _checked(image, reference, mask)
     values: NDArray[np.float64] = np.empty(image.shape)
@@ -137,8 +137,8 @@ def _checked(
     """The pixels that are measured; None for all.
 
     Raises:
-        ValueError: shapes differ.
-        UserError: no pixel is unmasked.
+        ValueError: The shapes differ.
+        UserError: No pixel is unmasked.
     """
     if image.shape != reference.shape or image.ndim != 3:
         raise ValueError(f"images of shapes {image.shape} and {reference.shape}")

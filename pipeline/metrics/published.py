@@ -19,8 +19,8 @@ def against_published(
 
     Args:
         name: A scene of ``PUBLISHED_SCENES``.
-        deviations: those known from the plan.
-        protocol, evaluation: how the scene was measured, and the result.
+        deviations: The deviations that are known from the plan.
+        protocol, evaluation: The protocol of the measurement and its result.
     """
     scene, described = PUBLISHED_SCENES[name], evaluation.protocol
     found = list(deviations)

@@ -83,10 +83,10 @@ def line_chart(
     """A line chart, with the values of each point as a tooltip.
 
     Args:
-        xs, ys: finite, at least one point.
-        y_label: formats a y value for a tooltip.
-        timed: x is a time in seconds.
-        log: logarithmic y axis; ignored unless all values are positive.
+        xs, ys: The points: finite values, at least one.
+        y_label: The function that formats a y value for a tooltip.
+        timed: Whether x is a time in seconds.
+        log: Whether the y axis is logarithmic; ignored unless all values are positive.
     """
     log = log and min(ys) > 0
     x_low, x_high = _range(min(xs), max(xs), pad=0.0)
@@ -119,9 +119,9 @@ class ChartPoint:
     """A point of a trade-off chart.
 
     Attributes:
-        seconds, error: finite and positive.
-        name: label; empty for a small point without a label.
-        tip: tooltip.
+        seconds, error: Finite and positive values.
+        name: The label; empty for a small point without a label.
+        tip: The tooltip.
         colour: The index of a colour of the page.
     """
 
@@ -142,8 +142,8 @@ def trade_off_chart(
     points.
 
     Args:
-        points: at least one.
-        y_label: formats an error for the axis.
+        points: The points, at least one.
+        y_label: The function that formats an error for the axis.
     """
     xs, ys = [d.seconds for d in points], [d.error for d in points]
     x_low, x_high, y_low, y_high = min(xs) / 1.3, max(xs) * 1.3, min(ys) / 1.12, max(ys) * 1.12
@@ -202,7 +202,7 @@ def histogram(
     """Counts of the values; those above the 99th percentile are in the last bar.
 
     Args:
-        values: finite, at least one.
+        values: The finite values, at least one.
         whole: One bar a whole number (or several, where there are more than ``bins``).
     """
     top = float(np.percentile(values, 99))

@@ -28,11 +28,11 @@ def collect_metrics(
 
     Args:
         scene: The name of the scene.
-        plan: of the scene.
+        plan: The plan of the scene.
         folder: ``results/<scene>``, which contains the folders of the stages.
-        evaluation: of the evaluate stage.
-        seed: of the run.
-        versions: of the packages that affect results.
+        evaluation: The result of the evaluate stage.
+        seed: The seed of the run.
+        versions: The versions of the packages that affect results.
 
     Raises:
         UserError: a stage's record is missing or damaged, or its counters are.

@@ -192,10 +192,10 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
     Args:
         batches: One or two ``benchmark.json``.
         base: The configuration that others are compared with; None: the default preset.
-        each: list the runs of one batch, without comparison.
+        each: List the runs of one batch, without comparison.
 
     Raises:
-        UserError: more than two files, a file that is no ``benchmark.json``, or an unknown
+        UserError: More than two files, a file that is no ``benchmark.json``, or an unknown
             configuration.
     """
     if len(batches) > 2:

@@ -71,9 +71,9 @@ class Batch:
 
     Attributes:
         results: One per run, ordered by scene; at least one.
-        renders: run's name -> render of a test view.
-        photos: scene -> the photograph of that view.
-        plans: scene -> plan of its first run.
+        renders: The render of a test view by the run's name.
+        photos: The photograph of that view by scene.
+        plans: The plan of a scene's first run, by scene.
         stages: Names in the order of the DAG.
     """
 

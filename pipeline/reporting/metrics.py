@@ -71,7 +71,7 @@ def read_metrics(folder: Path) -> Metrics:
     """The metrics of a finished scene's folder (``results/<scene>``).
 
     Raises:
-        UserError: they are missing or damaged.
+        UserError: The metrics are missing or damaged.
     """
     return Metrics.read(folder / "report")
 
@@ -81,7 +81,7 @@ def read_runs(metrics: Metrics, folder: Path, without: str = "") -> dict[str, Ru
     finished yet.
 
     Raises:
-        UserError: one is missing or damaged.
+        UserError: A record is missing or damaged.
     """
     return {
         name: together([read_run(folder / job) for job in job_folders(name, stage.jobs)])

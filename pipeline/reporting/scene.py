@@ -52,7 +52,7 @@ def read_results(
         shown: The number of views shown with their photographs.
 
     Raises:
-        UserError: an output of a stage is missing, damaged, or does not match the others.
+        UserError: An output of a stage is missing, damaged, or does not match the others.
     """
     scene = folders["inspect"].parent
     return SceneResults(

@@ -67,7 +67,7 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
     process ends, even by SIGKILL.
 
     Raises:
-        UserError: raised by the function.
+        UserError: The function raised it.
         RuntimeError: the function raised another exception; the message has its traceback.
         ProcessDied: the process died.
     """
@@ -79,7 +79,7 @@ def run_limited(limits: Limits, function: Callable[..., T], /, *args: Any, **kwa
 
     Raises:
         OverLimitError: the function exceeded a limit. Its process has ended.
-        UserError, RuntimeError, ProcessDied: as ``run_isolated``.
+        UserError, RuntimeError, ProcessDied: See ``run_isolated``.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)

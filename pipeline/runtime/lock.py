@@ -29,8 +29,8 @@ def lock_run(folder: Path) -> None:
     system without locks, only a warning is printed.
 
     Raises:
-        UserError: another process has locked it.
-        PermissionError: this user may not write the lock's file, and no process has locked it.
+        UserError: Another process has locked it.
+        PermissionError: This user may not write the lock's file, and no process has locked it.
     """
     path = _lock_file(folder)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def check_not_locked(folder: Path) -> None:
     allowed to write.
 
     Raises:
-        UserError: another process has.
+        UserError: Another process has locked it.
     """
     path = _lock_file(folder)
     if path.absolute() in _held:
@@ -90,7 +90,7 @@ def _lock(file: TextIO, kind: int, folder: Path) -> bool:
     """Lock a run's file. Return False if its file system has no locks.
 
     Raises:
-        UserError: another process has locked it.
+        UserError: Another process has locked it.
     """
     try:
         return _flock(file, kind | fcntl.LOCK_NB)
@@ -106,7 +106,7 @@ def _flock(file: TextIO, kind: int) -> bool:
     """Lock a file. Return False if its file system has no locks.
 
     Raises:
-        BlockingIOError: another process has locked it.
+        BlockingIOError: Another process has locked it.
     """
     try:
         fcntl.flock(file, kind)

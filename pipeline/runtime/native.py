@@ -104,7 +104,7 @@ class NativeLibrary:
         """The library for this processor, compiled if it does not exist.
 
         Raises:
-            UserError: there is no library and no compiler, or compiling fails; see also
+            UserError: There is no library and no compiler, or compiling fails; see also
                 ``targets.usable``.
         """
         variants = targets.usable_variants(self.extensions)
@@ -152,7 +152,7 @@ class NativeLibrary:
         interfere.
 
         Raises:
-            UserError: no compiler, or compiling fails.
+            UserError: There is no compiler, or compiling fails.
         """
         command = compiler()
         identity = compiler_identity(command)
@@ -245,7 +245,7 @@ def compiler() -> list[str]:
     """The C++ compiler's command.
 
     Raises:
-        UserError: there is none.
+        UserError: There is no compiler.
     """
     found = find_compiler()
     if found is None:
@@ -292,7 +292,7 @@ def build_targets(library: NativeLibrary, names: Sequence[str]) -> list[Built]:
     """A library for each variant of the named targets, compiled if it does not exist.
 
     Raises:
-        UserError: an unknown name, another architecture without $CXX, or as ``build``.
+        UserError: An unknown name, another architecture without $CXX, or as ``build``.
     """
     chosen: list[Target] = []
     for name in names:

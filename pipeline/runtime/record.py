@@ -133,7 +133,7 @@ def read_stage(folder: Path) -> StageRecord:
     """The record of a finished stage.
 
     Raises:
-        UserError: it is missing, damaged, or belongs to another stage.
+        UserError: The record is missing, damaged, or belongs to another stage.
     """
     record = read_record(folder / STAGE, StageRecord)
     if record.stage != folder.name:
@@ -149,7 +149,7 @@ def read_run(folder: Path) -> RunRecord:
     """The record of a finished stage's run.
 
     Raises:
-        UserError: its record is missing or damaged.
+        UserError: The stage's record is missing or damaged.
     """
     return read_record(folder / RUN, RunRecord)
 
@@ -161,7 +161,7 @@ def read_record(path: Path, model: type[M], fix: str | None = None) -> M:
         fix: The remedy for a damaged file. None means to rerun the stage whose folder it is in.
 
     Raises:
-        UserError: it is missing, truncated, or not valid for ``model``.
+        UserError: The record is missing, truncated, or not valid for ``model``.
     """
     fix = fix or rerun(path.parent)
     try:

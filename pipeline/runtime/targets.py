@@ -61,7 +61,7 @@ def named(name: str) -> Target:
     """The target with this name.
 
     Raises:
-        UserError: there is none.
+        UserError: There is no such target.
     """
     known = {target.name: target for target in (*TARGETS, native_target())}
     if name not in known:
@@ -83,7 +83,7 @@ def usable() -> list[Target]:
     names, if it is set.
 
     Raises:
-        UserError: that target is unknown or not supported by the processor, or no target is.
+        UserError: That target is unknown or not supported by the processor, or no target is.
     """
     if forced := os.environ.get(VARIABLE):
         target = named(forced)

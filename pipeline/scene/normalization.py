@@ -23,7 +23,7 @@ class Normalization:
     """``scene = scale * (given - origin)``. Axes and cameras' rotations are equal in both worlds.
 
     Attributes:
-        scale: scene units in one unit of the given world.
+        scale: The number of scene units in one unit of the given world.
         origin: (3,) float64, the scene's origin in the given world.
     """
 

@@ -126,7 +126,7 @@ def with_poses(model: Reconstruction, poses: Mapping[str, NDArray[np.float64]]) 
     """A copy of ``model`` with the poses of some images replaced.
 
     Args:
-        poses: image name -> (4, 4) world to camera.
+        poses: The (4, 4) world to camera by image name.
     """
 
     def updated(image: PosedImage) -> PosedImage:

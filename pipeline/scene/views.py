@@ -44,7 +44,8 @@ class View:
         is_test: Whether this is a test view, which is not trained on.
         camera_id: The key into ``Reconstruction.cameras``; views of one camera share intrinsics.
         has_listed_split: Whether the scene's own split says if this is a test view.
-        image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
+        image_digest, mask_digest: The digests of the files, checked when they are read; None: no
+            check.
         source: The name of the photograph of which this is a part; None for a whole photograph.
         crop: The part of the image that the view shows; None: all of it.
     """
@@ -112,7 +113,7 @@ def load_views(
 
     Args:
         views: The largest side of a view, and whether masks are used.
-        split: which views are test views.
+        split: The choice of test views.
 
     Raises:
         ValueError: a camera has lens distortion; undistort the photographs first.

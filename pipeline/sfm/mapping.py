@@ -71,7 +71,7 @@ def reconstruct(
         ground_control: The scene's ``gcp_list.txt``; None without one.
 
     Raises:
-        UserError: every attempt failed the quality check (see ``judge``).
+        UserError: Every attempt failed the quality check (see ``judge``).
     """
     quiet_colmap()
     total = len(manifest.photos)
@@ -166,7 +166,7 @@ def _check_complete(manifest: Manifest, database: Path) -> list[str]:
     """Check that every photograph is in the database; returns warnings.
 
     Raises:
-        UserError: photographs are missing from the database.
+        UserError: Photographs are missing from the database.
     """
     with pycolmap.Database.open(database) as opened:
         counts = {

@@ -109,7 +109,7 @@ def match_features(
         parts: The databases of the jobs that have matched them by ``match_chunk``, in order.
 
     Raises:
-        UserError: no pair of photographs could be verified.
+        UserError: No pair of photographs could be verified.
     """
     quiet_colmap()
     chosen = chosen or choose_pairs(scene, config)

@@ -66,7 +66,7 @@ def posed_model(
 
     Args:
         images: (image id, name, camera id).
-        poses: world to camera, in the same order.
+        poses: The transforms from world to camera, in the same order.
     """
     model = pycolmap.Reconstruction()
     for camera in cameras:

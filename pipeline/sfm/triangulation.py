@@ -68,7 +68,7 @@ def triangulate(
             out. Cameras of another size than their photographs are rescaled to the photographs.
 
     Raises:
-        UserError: no image of the model is among the photographs.
+        UserError: No image of the model is among the photographs.
     """
     with tempfile.TemporaryDirectory(prefix="splatmake-triangulation-") as folder:
         work = Path(folder)

@@ -25,7 +25,7 @@ class InitPoints:
     """The points that Gaussians are initialised from.
 
     Attributes:
-        source: what they are, for messages.
+        source: The name of the points' source, for messages.
         normals: See ``gaussians_from_points``.
     """
 
@@ -57,7 +57,7 @@ def first_gaussians(
 
     Args:
         training: The training views, for random initialisation and the scale of the scene.
-        seed: of random initialisation.
+        seed: The seed of random initialisation.
         skybox: Whether to add one behind the Gaussians (``pipeline.splats.skybox``).
     """
     points, source = init.points, init.source

@@ -82,7 +82,7 @@ def gaussians_from_points(
         normals: (P, 3) unit normals in the world, NaN where unknown; None if all are.
 
     Raises:
-        UserError: no point is usable.
+        UserError: No point is usable.
     """
     from scipy.spatial import cKDTree
 

@@ -16,7 +16,7 @@ def reduce_gaussians(
     optionally sort along a Z-order curve.
 
     Raises:
-        UserError: no Gaussian is left.
+        UserError: No Gaussian is left.
     """
     rows = np.arange(len(gaussians))
     if min_opacity > 0:

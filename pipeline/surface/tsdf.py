@@ -46,8 +46,9 @@ class Grid:
     """The voxels: those of ``blocks``.
 
     Attributes:
-        voxel: The side, world units. Voxel (i, j, k) has its centre at (i, j, k) * voxel.
-        far: depths beyond this are free space up to ``far``, and no surface.
+        voxel: The side of a voxel, world units. Voxel (i, j, k) has its centre at (i, j, k) *
+            voxel.
+        far: Depths beyond this are free space up to ``far``, and no surface.
         blocks: (B, 3) int64, sorted; block b holds voxels b * 8 to b * 8 + 7.
     """
 
@@ -81,10 +82,10 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
     """Choose the blocks within the truncation distance of the observed surface.
 
     Args:
-        depths: iterated several times.
-        voxel: The side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
-            is enlarged if ``MAX_MESH_VOXELS`` would be exceeded, or if blocks are narrower than a
-            pixel.
+        depths: The depth maps; iterated over several times.
+        voxel: The side of a voxel, world units; None takes ``PIXELS_PER_VOXEL`` at the median
+            depth. Either is enlarged if ``MAX_MESH_VOXELS`` would be exceeded, or if blocks are
+            narrower than a pixel.
 
     Returns:
         None if no map has a depth.

@@ -111,7 +111,7 @@ class Page:
         allowed_hosts: Further host names of the page (see ``access.refusal``).
 
     Raises:
-        UserError: viser is not installed.
+        UserError: The package viser is not installed.
     """
 
     def __init__(

@@ -41,7 +41,7 @@ class Source:
         cameras: See ``read_cameras``; None: those of ``results/NAME``.
 
     Raises:
-        UserError: there are no Gaussians yet, or no cameras.
+        UserError: There are no Gaussians yet, or no cameras.
     """
 
     def __init__(self, path: Path, cameras: Path | None):

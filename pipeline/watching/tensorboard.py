@@ -27,14 +27,14 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
     """Write each run's journal into ``out/<run>``, replacing existing events.
 
     Args:
-        folders: results of runs (``results/NAME``), or the folder that contains them.
+        folders: The results of runs (``results/NAME``), or the folder that contains them.
         follow: Keep writing new records until interrupted.
 
     Returns:
         Lines that describe what was written.
 
     Raises:
-        UserError: no journal found, or TensorBoard is not installed.
+        UserError: No journal was found, or TensorBoard is not installed.
     """
     journals = {file.parent.parent.name: file for folder in folders for file in _journals(folder)}
     if not journals:

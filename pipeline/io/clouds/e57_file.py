@@ -44,7 +44,7 @@ class Pages:
         """Read the header.
 
         Raises:
-            ValueError: not an E57 file, or shorter than its header says.
+            ValueError: The file is not an E57 file, or shorter than its header says.
         """
         self._file = file
         data = file.read(_HEADER.size).ljust(_HEADER.size, b"\0")
@@ -71,7 +71,7 @@ class Pages:
         """``size`` bytes from a logical offset on.
 
         Raises:
-            ValueError: they are not in the file, or a page has another checksum.
+            ValueError: The bytes are not in the file, or a page has another checksum.
         """
         if start < 0 or start + size > self.size:
             raise ValueError(f"expected {size} bytes at offset {start}, found the end of the file")
@@ -199,7 +199,7 @@ class Vector:
             space: "{namespace}" of E57's own names.
 
         Raises:
-            ValueError: an attribute is missing or wrong, or there is an unknown codec.
+            ValueError: An attribute is missing or wrong, or there is an unknown codec.
         """
         prototype = element.find(f"{space}prototype")
         if element.get("type") != "CompressedVector" or prototype is None:

@@ -28,7 +28,8 @@ def count_las(path: Path) -> int:
     """Number of points according to the header.
 
     Raises:
-        UserError: not a LAS or LAZ file, or more points than the file can hold.
+        UserError: The file is not LAS or LAZ, or its header claims more points than the file can
+            hold.
     """
     with opened_regular(path) as file:
         header = file.read(_HEADER)

@@ -99,7 +99,7 @@ def parsed(lines: list[bytes], separator: str | None, path: Path) -> NDArray[np.
     """(N, columns) numbers; numbers beyond float64 are infinite.
 
     Raises:
-        UserError: not numbers, or lines of different length.
+        UserError: Values are not numbers, or lines differ in length.
     """
     text = [line.decode("latin-1") for line in lines]
     if not text:

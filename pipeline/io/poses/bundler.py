@@ -40,7 +40,7 @@ def frames(path: Path) -> list[PosedFrame]:
     """The images that have a pose.
 
     Raises:
-        UserError: malformed files, or lists of different lengths.
+        UserError: Files are malformed, or lists differ in length.
     """
     _, listing = files(path)
     names = [_ENTRY.sub(r"\1", line) for line in read_text(listing).splitlines() if line.strip()]

@@ -61,7 +61,8 @@ def read_xml(file: Path) -> Element:
     """The root element of an XML file.
 
     Raises:
-        UserError: too large, not well-formed, nested too deeply, or with a document type.
+        UserError: The file is too large, not well-formed, nested too deeply, or with a document
+            type.
     """
     try:
         return parse_xml(bounded.read_bounded(file, _MAX_BYTES, fix=FIX))

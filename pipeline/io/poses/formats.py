@@ -46,7 +46,7 @@ class PoseFormat:
 
     Attributes:
         kind: The name of the format in records.
-        names: what the names of images refer to. "photos": the folder of the photographs;
+        names: What the names of images refer to. "photos": the folder of the photographs;
             "scene": the scene folder, so that the file lists the photographs; "order": the file
             has no names, its rows are the photographs sorted by name.
         find: The pose file or folder in a scene folder, relative to it; None without one.

@@ -100,7 +100,7 @@ def reconstruct(
         Images named by the keys of ``sizes``, one camera for equal intrinsics, no points.
 
     Raises:
-        UserError: names that are ambiguous (``match_names``).
+        UserError: Names are ambiguous (``match_names``).
     """
     distinct = distinct_frames(frames)
     by_name = {frame.name: frame for frame in distinct}

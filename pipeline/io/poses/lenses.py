@@ -72,7 +72,7 @@ def brown_camera(file: Path, where: str, width: float, height: float, lens: Brow
         where: What messages call the camera.
 
     Raises:
-        UserError: impossible intrinsics, or a lens that no model of COLMAP describes to within
+        UserError: Impossible intrinsics, or a lens that no model of COLMAP describes to within
             ``MAX_RESIDUAL_PX``.
     """
     k1, k2, k3, k4 = (*lens.k, 0.0, 0.0, 0.0, 0.0)[:4]
@@ -161,7 +161,7 @@ def fitted(
         start: The distortion coefficients to start from.
 
     Raises:
-        UserError: its largest error is ``MAX_RESIDUAL_PX`` or more.
+        UserError: The largest error is ``MAX_RESIDUAL_PX`` or more.
     """
     first = (*near.pinhole, *start)
     camera, residual = _nearest(model, near.width, near.height, first, lens)

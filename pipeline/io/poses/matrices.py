@@ -33,7 +33,7 @@ def pose_matrix(file: Path, where: str, value: Any) -> Array:
     """``value`` as a finite (4, 4) matrix; three rows get the last row of the identity.
 
     Raises:
-        UserError: other shapes, values that are no moderate numbers, a translation in the last
+        UserError: Other shapes, values that are no moderate numbers, a translation in the last
             row, or another last row than 0 0 0 1.
     """
     try:

@@ -51,7 +51,7 @@ def frames(file: Path) -> list[PosedFrame]:
     Components without a transform have worlds of their own: of these the largest is used.
 
     Raises:
-        UserError: malformed XML, no aligned camera, or a camera that is not supported.
+        UserError: Malformed XML, no aligned camera, or a camera that is not supported.
     """
     root = read_xml(file)
     chunks = root.findall("chunk") or root.findall("chunks/chunk")

@@ -36,7 +36,7 @@ def frames(path: Path) -> list[PosedFrame]:
     """The images of the file.
 
     Raises:
-        UserError: malformed files.
+        UserError: The files are malformed.
     """
     offset = _offset(path)
     lines = [line.strip() for line in read_text(path).splitlines()]

@@ -41,7 +41,7 @@ def frames(path: Path) -> list[PosedFrame]:
     """The images of the file.
 
     Raises:
-        UserError: malformed files, or several cameras.
+        UserError: The files are malformed or describe several cameras.
     """
     _, camera = files(path)
     lens = _lens(camera)

@@ -51,7 +51,7 @@ def csv_frames(file: Path) -> list[PosedFrame]:
     """The rows of the CSV file.
 
     Raises:
-        UserError: malformed rows.
+        UserError: Rows are malformed.
     """
     content = read_text(file)
     header = _header(content)

@@ -174,7 +174,7 @@ def check_poses(
         model: The given poses in the given world, with cameras of the photographs' sizes.
         photos: The photographs, sorted by name.
         kind: The format of the poses.
-        source: their file, for the message.
+        source: The file of the poses, for the message.
         matcher: The source of matches; default: one for this check alone.
 
     Raises:

@@ -114,10 +114,10 @@ class Reading:
     """Another reading of the given poses.
 
     Attributes:
-        cause: what the file looks like, as the end of "the poses look as if ...".
-        fix: how to correct the file.
+        cause: The likely mistake in the file, as the end of "the poses look as if ...".
+        fix: The way to correct the file.
         poses: The poses and cameras of this reading.
-        rank: readings that are as good are preferred by the lowest rank.
+        rank: The order of preference among equally good readings, lowest first.
     """
 
     cause: str

@@ -50,7 +50,7 @@ class MatchedPair:
     """Two photographs and their verified matches.
 
     Attributes:
-        one, two: positions of the photographs in the list.
+        one, two: The positions of the photographs in the list.
         xy_one, xy_two: (M, 2) pixels of the stored photographs.
         motion: The median distance between the two pixels of a match, as an angle in degrees of a
             camera with a nominal focal length (of a panorama, of its own).
@@ -85,7 +85,7 @@ class PairFinder:
 
     Args:
         photos: Photographs in the order of their names.
-        cameras: their given cameras, which may be wrong.
+        cameras: The given cameras of the photographs, which may be wrong.
         centres: (K, N, 3) positions of the photographs according to K readings of the poses, of
             which near ones are tried if the neighbours in the order of names do not match.
         matcher: The source of matches.

@@ -32,7 +32,7 @@ class AppearanceChoice:
         gains: Exposure gains of all views; empty if exposure is not modelled.
         embeddings: Whether views have appearance embeddings.
         decisions: Sentences for the user.
-        counters: what was measured, by the name of its counter.
+        counters: The measured values, by the name of its counter.
     """
 
     gains: ExposureGains = NO_GAINS

@@ -43,8 +43,8 @@ class Shown:
     """Constant SH coefficients (N, 3) while a photograph is rendered.
 
     Attributes:
-        own: of the scene.
-        shown: in the photograph.
+        own: The colours of the scene.
+        shown: The colours in the photograph.
     """
 
     own: Tensor

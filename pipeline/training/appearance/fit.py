@@ -40,7 +40,7 @@ def in_photograph(
     training photograph is fitted on its left half.
 
     Args:
-        gaussians: of the scene.
+        gaussians: The Gaussians of the scene.
         photo, mask: See ``fit_embedding``; the mask is False for ignored pixels.
     """
     gaussians = replace(gaussians, appearance=torch.from_numpy(appearance.colors))
@@ -67,7 +67,7 @@ def fit_embedding(
     squares.
 
     Args:
-        gaussians: with ``appearance``.
+        gaussians: The Gaussians with ``appearance``.
         photo: (H, W, 3), over the background of ``options``.
         pixels: (H, W), those to fit.
         known: (V, K) embeddings of the training photographs, of mean 0.

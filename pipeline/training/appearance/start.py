@@ -22,7 +22,7 @@ def initial_embeddings(views: Sequence[View], size: int) -> Array:
     photographs have the same statistics.
 
     Args:
-        size: at most 6.
+        size: The number of values, at most 6.
     """
     statistics = np.array([_statistics(view) for view in views])
     statistics -= statistics.mean(0)

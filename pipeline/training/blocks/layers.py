@@ -35,10 +35,11 @@ class BlockLayers:
     Attributes:
         coarse: The Gaussians of the whole scene before the blocks are trained.
         partition, number: The block.
-        corrects: what explains the part of an error that the block is to correct.
-        background: behind the scene.
-        options: as in training, without a background.
-        gains: of the views, by which renders are multiplied before they are compared.
+        corrects: The model that splits an error into the block's part and the rest.
+        background: The background behind the scene.
+        options: The options of training, without a background.
+        gains: The exposure gains of the views, by which renders are multiplied before they are
+            compared.
     """
 
     coarse: Gaussians

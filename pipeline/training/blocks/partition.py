@@ -61,7 +61,7 @@ class PartitionOptions:
         max_gaussians: The upper limit of the number of Gaussians of a block that fills its views.
         view_pixels: The number of pixels of a typical view.
         pixels_per_gaussian: Training pixels of all views together for a Gaussian.
-        steps: of one block for the whole scene.
+        steps: The number of steps of one block for the whole scene.
         raster: Options of rendering, with near plane and antialiasing of the training.
     """
 

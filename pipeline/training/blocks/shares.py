@@ -34,7 +34,7 @@ def explained_shares(
     Args:
         grey: All Gaussians, of SH degree 0.
         regions: (N,) bool each, at least one.
-        options: of SH degree 0 and without a background.
+        options: The options of rendering, of SH degree 0 and without a background.
     """
     white = 0.5 / SH_C0
     shares: Shares = []

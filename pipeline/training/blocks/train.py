@@ -53,7 +53,7 @@ def block_training(
         run: The part of the training of the whole scene.
 
     Raises:
-        UserError: no view sees the block.
+        UserError: No view sees the block.
     """
     partition = scene.partition
     block = partition.blocks[number - 1]

@@ -22,7 +22,7 @@ class Union:
     (``arrays.GaussianSource``).
 
     Args:
-        files: of the blocks' Gaussians, by number.
+        files: The files of the blocks' Gaussians, by number.
 
     Raises:
         UserError: a file is missing, damaged, or not one of Gaussians.

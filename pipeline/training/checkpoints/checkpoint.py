@@ -32,9 +32,9 @@ class Checkpoint:
     """The whole state of a run.
 
     Attributes:
-        step: steps done.
+        step: The number of steps done.
         identity: The digest of the run's inputs and options.
-        arrays: by name.
+        arrays: The arrays by name.
         values: The rest of the state, as JSON.
     """
 

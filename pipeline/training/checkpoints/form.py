@@ -26,11 +26,11 @@ def check_arrays(arrays: Arrays, like: Arrays) -> None:
     """Check the arrays of a checkpoint.
 
     Args:
-        like: those of the run before its first step. Only the number of Gaussians and of spherical
-            harmonics may differ.
+        like: The arrays of the run before its first step. Only the number of Gaussians and of
+            spherical harmonics may differ.
 
     Raises:
-        ValueError: an array is missing, or has another type or shape.
+        ValueError: An array is missing, or has another type or shape.
     """
     if arrays.keys() != like.keys():
         name = min(arrays.keys() ^ like.keys())
@@ -60,7 +60,7 @@ def check_position(values: Mapping[str, Any], views: int) -> None:
         views: The number of training views.
 
     Raises:
-        ValueError: it is not one of a run with these views.
+        ValueError: The position is not one of a run with these views.
     """
     position, clock = values["position"], values["clock"]
     if type(position) is not int or not 0 <= position <= views:

@@ -22,7 +22,7 @@ def add_dense_depths(
     """``points`` with samples of the views' dense depth maps, whose weights are their confidences.
 
     Args:
-        folder: outputs of the stage dense.
+        folder: The outputs of the stage dense.
 
     Raises:
         UserError: a depth map is missing or damaged.

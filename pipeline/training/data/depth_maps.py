@@ -132,7 +132,7 @@ def add_maps(
     """``points`` with the samples of the views' depth maps.
 
     Args:
-        maps: each view's file and its recorded digest; None for a view without a depth map.
+        maps: Each view's file and its recorded digest; None for a view without a depth map.
         fitted_to: The depths that maps are fitted to: ``points``, or others if there are none.
 
     Returns:

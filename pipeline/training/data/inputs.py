@@ -30,13 +30,13 @@ class Inputs:
             without alpha.
         embeddings: (V, K) appearance embeddings of the photographs before training
             (``training.appearance``); None: appearance is not modelled. Only for a whole scene.
-        depths: known depths of each view for the depth loss (``training.losses.depth``).
+        depths: The known depths of each view for the depth loss (``training.losses.depth``).
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
         seen_share: The mean share of the views that see a Gaussian (``scene.visibility``).
-        open_layers: for a block of a scene, makes the source of the layers around it in each view,
-            which renders with so many threads and is not held during training; None: the Gaussians
-            are the whole scene.
+        open_layers: For a block of a scene, it makes the source of the layers around it in each
+            view, which renders with so many threads and is not held during training; None: the
+            Gaussians are the whole scene.
     """
 
     views: Sequence[View]

@@ -32,7 +32,8 @@ class Target:
         alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
         ignored: (H, W) bool, True for ignored pixels, or None if there are none.
         surroundings: The layers around a block, or None if the whole scene is trained.
-        is_overview: of a block: the block is in the ignored pixels, and trained in another view.
+        is_overview: Whether the view is an overview of a block: the block is in the ignored pixels,
+            and trained in another view.
     """
 
     rgb: Tensor
@@ -72,7 +73,7 @@ class Layers:
         weight: (H, W) float32, the part of the scene's error that the block is to correct; other
             blocks correct the rest.
         coarse: (H, W, 3) uint8, the scene before training with the view's exposure.
-        background: behind the scene, and behind photographs with alpha.
+        background: The background behind the scene, and behind photographs with alpha.
         ignored: (H, W) bool, pixels that another view of the block shows; None if there are none.
     """
 

@@ -36,7 +36,7 @@ class Timeline:
 
     Attributes:
         start, stop: The first and last step of densification.
-        interval: steps between densifications, and afterwards between prunings.
+        interval: The number of steps between densifications, and afterwards between prunings.
         prune_stop: The last step of pruning.
     """
 

@@ -42,7 +42,7 @@ class MetricsLog:
 
     Args:
         path: None writes nothing. Errors of writing are ignored.
-        step: steps done.
+        step: The number of steps done.
     """
 
     def __init__(self, path: Path | None, step: int):

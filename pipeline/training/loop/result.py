@@ -21,20 +21,21 @@ class TrainResult:
     """A trained scene.
 
     Attributes:
-        gaussians: with SH of the configured degree, in the colours of the mean photograph.
-        curve: deterministic.
+        gaussians: The Gaussians with SH of the configured degree, in the colours of the mean
+            photograph.
+        curve: The records of the metrics log, deterministic.
         curve_seconds: The training time of each record; differs between runs.
         counters: The totals of the run (``state.Counters``).
         near: The near plane of the training, world units; renders need the same.
-        background: of the training: black, white or random.
-        warnings: for the user; deterministic.
+        background: The background of the training: black, white or random.
+        warnings: The warnings for the user; deterministic.
         steps: The number of optimiser steps.
         seconds: The training time in all processes of the run.
         built: ``Backend.facts`` of the last process.
         poses: (4, 4) refined world to camera of each view by name, or None.
         intrinsics: (3,) change of each camera's intrinsics by id
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
-        appearance: of the Gaussians in the training views, or None.
+        appearance: The appearance of the Gaussians in the training views, or None.
     """
 
     gaussians: Gaussians

@@ -98,7 +98,8 @@ class Schedule:
         Args:
             warm_up: The factor of all of them.
             run_length: The number of optimiser steps of the whole run, or its estimate.
-            unit: of the means' learning rate, world units; 1 for each Gaussian's own scales.
+            unit: The unit of the means' learning rate, world units; 1 for each Gaussian's own
+                scales.
         """
         rates = self.options.experiments
         run_factor = self.learning_rate_factor(run_length) * warm_up

@@ -38,10 +38,10 @@ class TrainingScene:
     """The scene during training; only the cache of cameras changes.
 
     Attributes:
-        inputs: without views that their masks hide completely.
+        inputs: The inputs without views that their masks hide completely.
         targets: The pixels of ``inputs.views``.
         gains: (V, 3) float32 factors of the renders, or None.
-        background: black, white or random.
+        background: The background: black, white or random.
         near: The near plane, world units.
         sky: None without a skybox.
     """
@@ -73,7 +73,7 @@ def load_scene(inputs: Inputs, run: TrainingRun, warn: Warn) -> TrainingScene:
     """Read the images of the views.
 
     Raises:
-        UserError: an image cannot be read, or the masks hide all views.
+        UserError: An image cannot be read, or the masks hide all views.
     """
     targets = read_targets(inputs, run)
     near = near_plane(inputs.extent)

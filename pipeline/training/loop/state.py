@@ -27,11 +27,11 @@ class Counters:
     """Totals of the run.
 
     Attributes:
-        changes: of density control.
+        changes: The totals of density control.
         opacity_resets: The number of opacity resets.
         max_gaussians: The largest number of Gaussians.
         num_dropped: Gaussians that the rasterizer left out for numerical reasons, over all steps.
-        blind_steps: steps whose view saw no Gaussian.
+        blind_steps: The number of steps whose view saw no Gaussian.
         unseen: Gaussians removed at the end because no training view saw them.
         floaters: Gaussians removed because they were close to a single camera.
     """
@@ -172,7 +172,7 @@ class TrainState:
         """Restore the state that ``arrays()`` and ``values()`` returned.
 
         Raises:
-            ValueError: they are not those of such a run. The state is unchanged.
+            ValueError: The values are not those of such a run. The state is unchanged.
         """
         check_arrays(arrays, self.arrays())
         rng = np.random.default_rng()

@@ -20,7 +20,7 @@ class StepTimeEstimator:
     Attributes:
         budget: The seconds of the whole run.
         step_seconds: The time of a step at full resolution; 0 before the first measurement.
-        started: step, seconds and resolution factor at the start of the current measurement.
+        started: The step, seconds and resolution factor at the start of the current measurement.
     """
 
     budget: float

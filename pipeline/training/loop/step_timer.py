@@ -15,7 +15,7 @@ class StepTimer:
     """Measures some early steps of one process, once.
 
     Args:
-        steps: remaining steps of the run.
+        steps: The remaining steps of the run.
     """
 
     def __init__(self, build: Mapping[str, str], threads: int, steps: int):
@@ -29,8 +29,8 @@ class StepTimer:
         """The line for the log after the last measured step, else None.
 
         Args:
-            seconds: of training so far.
-            factor: by which the images were reduced.
+            seconds: The seconds of training so far.
+            factor: The factor by which the images were reduced.
         """
         self.done += 1
         if self.done == self.first:

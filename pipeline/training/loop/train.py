@@ -38,7 +38,7 @@ def train(
         backend: The rasterizer's backend; None: that of ``run.options.device``.
 
     Raises:
-        UserError: no views or no Gaussians, unreadable images, no view sees a Gaussian, the loss is
+        UserError: No views or no Gaussians, unreadable images, no view sees a Gaussian, the loss is
             not finite, or no Gaussian is left.
     """
     if not inputs.views or not len(inputs.initial):

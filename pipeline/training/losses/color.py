@@ -18,7 +18,7 @@ class ColorGradients:
     Attributes:
         d_color: (H, W, 3) gradient with respect to the rendered colours.
         d_alpha: (H, W) gradient with respect to alpha, for a block among its surroundings.
-        psnr: dB; None if it was not measured.
+        psnr: The PSNR in dB; None if it was not measured.
     """
 
     loss: float

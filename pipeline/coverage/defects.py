@@ -41,7 +41,7 @@ def holes(probe: ProbeView, observed: Observations, opaque: Bools | None) -> Boo
     """(H, W) pixels whose ray meets no surface although one is there.
 
     Args:
-        observed: The visibility of the probe view's points.
+        observed: The observations of the probe view's points.
         opaque: (H, W) opaque pixels of the photograph, if it has an alpha channel: these show a
             surface. Without (None), pixels are holes unless ``MIN_AGREEING`` photographs show
             background there as well.
@@ -55,7 +55,7 @@ def floating(probe: ProbeView, observed: Observations, nearest: float) -> Bools:
     and that as many see past or that is nearer than any certain surface.
 
     Args:
-        observed: The visibility of the probe view's points.
+        observed: The observations of the probe view's points.
         nearest: The distance of the nearest certain surfaces, world units.
     """
     shape = probe.empty.shape

@@ -78,7 +78,7 @@ class MeasuredView:
         trust: (H, W), in [0, 1].
         squared_error: (H, W) mean over the channels, for colours in [0, 1].
         measured: (H, W) True in the pixels that are measured.
-        record: The entry in ``coverage.json``.
+        record: The view's entry in ``coverage.json``.
     """
 
     probe: ProbeView

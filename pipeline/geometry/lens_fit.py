@@ -33,7 +33,7 @@ def fit_camera(
             2).
 
     Returns:
-        The camera, and the largest error over the image in pixels: infinity if ``lens`` has no
+        The camera and the largest error over the image in pixels: infinity if ``lens`` has no
         inverse somewhere in the image.
     """
     from scipy.optimize import least_squares  # Heavy, and few scenes need it.

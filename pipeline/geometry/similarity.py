@@ -70,10 +70,10 @@ class Uncertainty(NamedTuple):
     """Standard deviations of a fitted similarity.
 
     Attributes:
-        scale: The error of the scale, relative to it.
-        heading: The angle in radians about the vertical axis.
-        tilt: The angle in radians about the horizontal axis that is determined worst, by the points
-            of which all coordinates were measured.
+        scale: The deviation of the scale, relative to the scale.
+        heading: The deviation in radians about the vertical axis.
+        tilt: The deviation in radians about the horizontal axis that is determined worst, by the
+            points of which all coordinates were measured.
     """
 
     scale: float
@@ -232,7 +232,7 @@ def _uncertainty(source: Array, weight: Array, similarity: Similarity, sigma: fl
     """Standard deviations from the covariance of the least squares solution."""
     rotated = similarity.scale * centred(source) @ similarity.rotation.T
     jacobian = (_jacobian(rotated) * weight[:, :, None]).reshape(-1, 7)
-    # In units of the extent, so that the eigenvalues of all parameters compare.
+    # Use units of the extent, so that the eigenvalues of all parameters compare.
     extent = max(float(np.abs(rotated).max()), 1e-300)
     jacobian = jacobian / np.array([extent] * 4 + [1.0] * 3)
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)

@@ -24,7 +24,7 @@ from pipeline.runtime.atomic import written
 # less; a file that is made to exhaust the memory compresses a thousand times.
 _MAX_EXPANSION = 100
 _MAX_MEMBERS = 1000
-# Bytes that are read at a time.
+# The number of bytes that are read at a time.
 _PIECE = 1 << 20
 
 
@@ -98,7 +98,7 @@ def read_archive(file: BinaryIO) -> dict[str, NDArray]:
     """The arrays of a ``.npz`` file by name, in the file's order.
 
     Raises:
-        ValueError: The file is not of this kind, or one that would expand to many times its size.
+        ValueError: The file is not of this kind, or would expand to many times its size.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)

@@ -66,7 +66,7 @@ def read_text(path: Path, limit: int, *, fix: str) -> str:
     write.
 
     Raises:
-        UserError: See ``read_bounded``; or the text has other bytes.
+        UserError: See ``read_bounded``; or the bytes are no such text.
     """
     data = read_bounded(path, limit, fix=fix)
     try:

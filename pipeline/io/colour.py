@@ -326,7 +326,7 @@ def linear_to_srgb_primaries(
     """
     matrix = np.linalg.solve(icc.matrix_of(icc.SRGB), to_xyz).astype(np.float32)
     red, green, blue = light[..., 0], light[..., 1], light[..., 2]
-    # Not a matrix product: the bits of that may depend on the number of threads.
+    # Avoid a matrix product, whose bits may depend on the number of threads.
     rows = [row[0] * red + row[1] * green + row[2] * blue for row in matrix]
     return np.stack(rows, axis=-1)
 

@@ -48,8 +48,8 @@ def read_header(file: IO[bytes]) -> ExrHeader:
     """The header of a file with colours in R, G, B or with luminance in Y.
 
     Raises:
-        ValueError: The file is not OpenEXR, or one without such channels; a crop of a larger image;
-            or an impossible size.
+        ValueError: The file is not OpenEXR, lacks such channels, is a crop of a larger image, or
+            has an impossible size.
     """
     opened = _open(file, header_only=True)
     header = opened.header()
@@ -132,7 +132,7 @@ def _open(file: IO[bytes], *, header_only: bool) -> Any:
     import OpenEXR  # Imported only if the scene has such files.
 
     try:
-        # One thread: scenes are read by several threads, an image each.
+        # Use one thread: scenes are read by several threads, an image each.
         return OpenEXR.File(file, separate_channels=True, header_only=header_only, num_threads=0)
     except (RuntimeError, TypeError) as error:
         raise ValueError(f"OpenEXR: {str(error).splitlines()[0]}") from None

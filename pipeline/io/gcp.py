@@ -44,10 +44,10 @@ class GroundPoint:
 
     Attributes:
         name: The name in the file, else "gcp1" and so on in the file's order.
-        position: The x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
+        position: x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
             z in metres.
-        pixels: The pixel by the photograph's name, COLMAP's convention (the first pixel's centre is
-            0.5).
+        pixels: The pixel by the photograph's name, in COLMAP's convention (the first pixel's centre
+            is 0.5).
     """
 
     name: str
@@ -63,7 +63,7 @@ class GroundControl:
         projection: The file's projection; ``points`` are in its metres or degrees.
         points: The points that a photograph of the scene shows.
         unknown: The names of photographs that are not in the scene.
-        warnings: Sentences for the user.
+        warnings: The sentences for the user.
     """
 
     projection: Projection
@@ -113,7 +113,7 @@ def read_ground_control(
     """Read ``gcp_list.txt``.
 
     Args:
-        sizes: The width and height by photograph of the scene. Names match as in ``NameIndex``.
+        sizes: The width and height by the photograph's name. Names match as in ``NameIndex``.
         complete: Whether these are all photographs; False if frames of videos will follow.
 
     Raises:
@@ -182,7 +182,7 @@ def read_ground_control(
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Numbers and texts of the lines that are neither empty nor comments."""
     text = read_text(path, MAX_BYTES, fix=_FIX)
-    # Of the characters that ``splitlines`` takes for ends of lines, only these are.
+    # ``splitlines`` takes further characters for ends of lines; only these are.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if len(lines) > MAX_LINES:
         raise UserError(
@@ -290,7 +290,7 @@ def _check_coordinates(path: Path, projection: Projection, rows: list[_Row]) -> 
     """Check that the coordinates are possible in the projection.
 
     Raises:
-        UserError: The coordinates are not valid; the message names the order if it is swapped.
+        UserError: The coordinates are impossible; the message says so if the order is swapped.
     """
     written = np.array([row.position for row in rows])
     swapped = written[:, [1, 0, 2]]

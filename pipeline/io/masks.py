@@ -78,7 +78,7 @@ def _bright(
 ) -> tuple[NDArray[np.bool_], int | None]:
     valid = largest > top // 2
     if colours.shape[2] == 3:
-        # As integers: differences of unsigned values.
+        # Unsigned values do not wrap around here: the largest is at least the smallest.
         valid |= largest - colours.min(axis=2) >= _COLOURED * top
     highest, lowest = int(largest.max()), int(largest.min())
     if valid.any() or highest == 0 or not lossless:

@@ -30,7 +30,7 @@ MAX_PIXELS = 1 << 29
 # Decoders that hold several copies of the pixels, and the bytes that they take for each.
 _DECODER_BYTES = {"WEBP": 24, "AVIF": 16, "HEIF": 16}
 _MAX_DECODED = 3 << 30
-# Bytes of XMP that are searched.
+# The number of bytes of XMP that are searched.
 _MAX_XMP = 1 << 20
 # The largest side that libpng decodes.
 _MAX_SIDE = 1_000_000

@@ -164,7 +164,7 @@ def _read_ascii(file: BinaryIO, header: PlyHeader, path: Path) -> dict[str, NDAr
         if 2 * header.count * len(header.fields) > len(body) + 1:  # A digit and a separator each.
             raise ValueError
         values = np.empty((header.count, len(header.fields)))
-        # In pieces: a number takes ten times as much memory as an object.
+        # Write in pieces: a number takes ten times as much memory as an object.
         for start in range(0, header.count, _ROWS):
             piece = [row.split() for row in rows[start : min(start + _ROWS, header.count)]]
             values[start : start + _ROWS] = np.array(piece, np.float64)

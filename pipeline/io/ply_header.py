@@ -20,7 +20,7 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-# Bytes. Headers have fewer than a hundred lines; a longer one belongs to another kind of file.
+# The limit in bytes: headers have fewer than a hundred lines; a longer one is of another format.
 _MAX_HEADER = 1 << 16
 # More digits are no number of vertices, and slow to convert.
 _MAX_DIGITS = 15

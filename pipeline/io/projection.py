@@ -179,7 +179,7 @@ def _standard(text: str) -> str:
     """OpenDroneMap's names of UTM zones as EPSG codes; other texts unchanged.
 
     Raises:
-        ValueError: The text is not PROJ's, or there is no such zone.
+        ValueError: The text is no projection, or there is no such zone.
     """
     if not text or len(text) > _MAX_LENGTH or "\0" in text:
         raise ValueError(f"expected a projection, found: {shortened(text)}")

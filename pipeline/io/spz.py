@@ -214,7 +214,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
                 f"expected Gaussians of at most {_MAX_EXPANSION} times the file's size, found "
                 f"{expected} bytes of them"
             )
-        # At most one byte more than expected, so that a malicious file cannot exhaust the memory.
+        # One byte more than expected shows an excess; a malicious file could exhaust the memory.
         body = stream.decompress(stream.unconsumed_tail, expected + 1)
     except zlib.error as error:
         raise wrong(f"expected an SPZ file (gzip), could not read it: {error}") from None
@@ -284,7 +284,7 @@ def _pack_quats(quats: Doubles) -> NDArray[np.uint8]:
     q = np.where(norm > 0, quats / np.where(norm > 0, norm, 1), (1.0, 0, 0, 0))[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(1)
     rows = np.arange(len(q))
-    # q and -q are the same rotation: the omitted component is made positive.
+    # q and -q are the same rotation, so the omitted component is made positive.
     q = np.where(q[rows, largest, None] < 0, -q, q)
     magnitude = np.rint(np.abs(q) * _QUAT_STEPS).clip(0, 511).astype(np.uint32)
     code = magnitude | ((q < 0).astype(np.uint32) << np.uint32(9))

@@ -211,7 +211,7 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
 
     Args:
         path: A scene folder or a file.
-        sizes: The photograph (relative to the folder of the json) -> width and height in pixels.
+        sizes: The width and height in pixels by photograph, relative to the folder of the json.
             Frames of other photographs are omitted; suffixes may differ. Intrinsics refer to
             these sizes if the file has no ``w`` and ``h``.
 

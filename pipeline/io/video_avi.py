@@ -19,7 +19,7 @@ def read_header(file: BinaryIO) -> Header:
     """Read the streams of the first list of headers.
 
     Raises:
-        ValueError: there is none.
+        ValueError: The file has no such list.
     """
     length = file.seek(0, 2)
     file.seek(4)

@@ -64,7 +64,7 @@ def blocks_map(results: SceneResults, partition: Partition) -> BlocksMap:
 
 
 def _flat(axes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    # einsum, not a matrix product: BLAS may round differently with the number of threads.
+    # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
     return np.einsum("ij,nj->ni", axes, points)
 
 

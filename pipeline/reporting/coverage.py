@@ -45,7 +45,7 @@ class CoverageContent:
 
     Attributes:
         worst: The test views of least trust.
-        facts: Names and values.
+        facts: The names and values.
         above: The map; None without viewpoints.
         gradient: The colours of trust as CSS.
         pictures: The images of the record by name.

@@ -74,7 +74,7 @@ class Batch:
         renders: The render of a test view by the run's name.
         photos: The photograph of that view by scene.
         plans: The plan of a scene's first run, by scene.
-        stages: Names in the order of the DAG.
+        stages: The names of the stages in the order of the DAG.
     """
 
     results: Sequence[Result]

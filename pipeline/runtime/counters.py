@@ -38,7 +38,7 @@ class Report(Generic[C]):
 
     Attributes:
         counters: The stage's counters.
-        decisions, warnings: Sentences for the log.
+        decisions, warnings: The sentences for the log.
         num_cached: The number of results found in a cache. It is no counter, because it depends on
             earlier runs.
     """

@@ -156,7 +156,7 @@ def _give_up_network() -> None:
     """Move this process to a network without interfaces, where the kernel allows it (Linux)."""
     libc = ctypes.CDLL(None)
     if sys.platform == "linux" and hasattr(libc, "unshare") and libc.unshare(_NEW_NETWORK) != 0:
-        # Without privileges, only in a user namespace.
+        # Without privileges, this is possible only in a user namespace.
         libc.unshare(_NEW_USER | _NEW_NETWORK)
 
 

@@ -31,7 +31,7 @@ from pipeline.runtime.processor import processor
 from pipeline.runtime.targets import Extensions, Target, Variant
 
 RECORD = "library.json"
-# In order of preference if $CXX is not set. On macOS, g++ is clang.
+# The compilers are in order of preference if $CXX is not set. On macOS, g++ is clang.
 COMPILERS = ("c++", "clang++") if sys.platform == "darwin" else ("g++", "clang++")
 
 # Modules whose command line builds a library.

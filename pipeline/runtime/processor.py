@@ -68,7 +68,7 @@ def darwin_features(intel: Iterable[str], arm: str) -> frozenset[str]:
     """The features in macOS's sysctl values, with Linux's names.
 
     Args:
-        intel: Values of machdep.cpu.features, leaf7_features and extfeatures; may be empty.
+        intel: The values of machdep.cpu.features, leaf7_features and extfeatures; may be empty.
         arm: The values below hw.optional.arm, one ``name: value`` per line; may be empty.
     """
     names = " ".join(intel).split()

@@ -41,7 +41,7 @@ _V2 = processor.BASELINE["x86-64"]
 _V3 = _V2 | {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 _V4 = _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
 
-# In ascending order within each architecture.
+# The targets are in ascending order within each architecture.
 TARGETS = (
     Target("x86-64-v2", "x86-64", ("-march=x86-64-v2",), _V2),
     Target("x86-64-v3", "x86-64", ("-march=x86-64-v3",), _V3),

@@ -38,7 +38,7 @@ class Box:
 
     def along_axes(self, points: NDArray[Any]) -> Array:
         """(N, 3) points of the world, along the box's axes."""
-        # einsum, not a matrix product: BLAS may round differently with the number of threads.
+        # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
         return np.einsum("ij,nj->ni", self.axes, np.asarray(points, np.float64))
 
     def contains(self, points: NDArray[Any]) -> NDArray[np.bool_]:

@@ -23,12 +23,12 @@ from pipeline.scene.reconstruction import PosedImage, Reconstruction
 Array = NDArray[np.float64]
 
 FILE = "unrounded.npz"
-# Relative to the size of the scene. Cameras: the resolution of float32, in which Gaussians are
-# stored. Points, of which there are thousands of times as many: coarser, so that few of them lie
+# The steps are relative to the size of the scene. Cameras have the resolution of float32, in which
+# Gaussians are stored. Points are thousands of times as many: a coarser step leaves few of them
 # within a rounding error of where the nearest multiple changes.
 _CENTRE_STEP = 2.0**-22
 _POINT_STEP = 2.0**-17
-# Of unit quaternions' elements.
+# The rounding step of unit quaternions' elements.
 _QUATERNION_STEP = 2.0**-40
 # Values that are written, read and computed with anew differ by less, refined ones by more.
 _CENTRE_DRIFT, _ROTATION_DRIFT = 2.0**-12 * _CENTRE_STEP, 2.0**-46

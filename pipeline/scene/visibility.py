@@ -32,7 +32,7 @@ class Projection(NamedTuple):
 
 def projected(xyz: NDArray[np.float64], view: View) -> Projection:
     """Project (N, 3) points of the world."""
-    # einsum, not a matrix product: BLAS may round differently with the number of threads.
+    # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
     local = np.einsum("ij,nj->ni", view.world_to_camera[:3, :3], xyz)
     local += view.world_to_camera[:3, 3]
     z = local[:, 2]

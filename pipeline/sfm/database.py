@@ -215,7 +215,7 @@ def build_database(
     Args:
         pairs: Indices into the images, the smaller one first.
         cache: A folder for results of pairs that outlives the call; None for a temporary one.
-        matched: Files of ``match_pairs`` with their pairs, which are added to the cache.
+        matched: The files of ``match_pairs`` with their pairs, which are added to the cache.
 
     Returns:
         The number of pairs found in the cache.

@@ -90,7 +90,7 @@ def extract_photos(
     cache.mkdir(parents=True, exist_ok=True)
     keys = {photo.name: _cache_key(photo, config) for photo in photos}
     absent = [p for p in photos if not (cache / f"{keys[p.name]}.npz").exists()]
-    # One photograph of each key: identical photographs would write the same file concurrently.
+    # Use one photograph of each key: identical photographs would write the same file concurrently.
     missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv

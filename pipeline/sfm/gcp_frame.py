@@ -90,7 +90,7 @@ def from_gcp(
     if fit is None:
         return _ON_A_LINE
     fit = robust_similarity(source, target, np.ones(3), _noise(source, target, pixel, fit)) or fit
-    # With the errors that such measurements usually have: those of a mistake are larger.
+    # Expect the errors that such measurements usually have; those of a mistake are larger.
     usual = min(1.0, noise.sigma / max(fit.sigma, 1e-300))
     if fit.uncertainty.tilt * usual > MAX_TILT_RAD:
         return _line_text(fit)

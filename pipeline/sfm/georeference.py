@@ -80,7 +80,7 @@ class WorldFrame:
         residuals: The residual of each photograph (GPS) or point (GCP).
         fit: The fit that the similarity belongs to; None for "level".
         tilt_from: What determines the tilt.
-        decisions, warnings: Sentences for the log.
+        decisions, warnings: The sentences for the log.
     """
 
     method: Method

@@ -213,7 +213,7 @@ def _in_feet(centres: Array, measured: _Measured, cameras: Cameras) -> bool:
         return False
     places = centred(fit.similarity(centres[known]))
     altitudes = measured.enu[known, 2] - measured.enu[known, 2].mean()
-    # With x and y: the tilt of the frame is inaccurate.
+    # Altitudes are fitted with x and y as well, since the tilt of the frame is inaccurate.
     factors, _, rank, _ = np.linalg.lstsq(places, altitudes, rcond=1e-9)
     if rank < 3:
         return False

@@ -39,7 +39,7 @@ def run_mapper(
         models = run(_with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
     smallest = min(MIN_MODEL_SIZE, total)
     models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
-    # Of models with equally many images, the one with more points comes first.
+    # Among models with equally many images, the one with more points comes first.
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     return models
 

@@ -43,7 +43,7 @@ class MatchingScene:
 
     Attributes:
         features: The folder that ``extract_features`` wrote.
-        sharing: Options of the sfm stage, of which the camera model and sharing are used.
+        sharing: The options of the sfm stage, of which the camera model and sharing are used.
         seed: The seed of RANSAC.
     """
 
@@ -57,7 +57,7 @@ class MatchingScene:
         """The photographs in the order of their names, with ids from 1.
 
         Args:
-            focals: Camera id -> initial focal length, pixels, of fisheye lenses without a prior.
+            focals: The initial focal length in pixels of fisheye lenses without a prior, by camera id.
         """
         cameras, camera_of = plan_cameras(self.manifest, self.sharing)
         for camera in cameras:
@@ -80,7 +80,7 @@ class MatchingScene:
         colours of one image in memory at a time."""
         with zipfile.ZipFile(path, "w") as archive:
             for image_id, colors in self.inputs().colors():
-                # By its name, a member gets a fixed date.
+                # A member written by its name gets a fixed date.
                 with archive.open(f"{image_id}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, colors)
 

@@ -23,7 +23,7 @@ LIBRARY = NativeLibrary(
     file="libmatcher.so",
     sources=Path(__file__).parent / "csrc",
     flags=("-std=c++17", "-O3", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-unknown-warning-option"),
-    # Instructions for dot products of bytes.
+    # These instructions are dot products of bytes.
     extensions={
         "x86-64-v3": [Extension("avx_vnni", ("-mavxvnni",))],
         "x86-64-v4": [Extension("avx512_vnni", ("-mavx512vnni",))],

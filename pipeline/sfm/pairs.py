@@ -204,7 +204,7 @@ def _strongest(
     Args:
         scored: (M, 3) scores and pairs.
     """
-    # Of equal scores, the pairs of earlier photographs come first.
+    # Among equal scores, the pairs of earlier photographs come first.
     scored = scored[np.lexsort((scored[:, 2], scored[:, 1], -scored[:, 0]))]
     ends = scored[:, 1:].ravel()
     by_photo = np.argsort(ends, kind="stable")

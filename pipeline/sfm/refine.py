@@ -32,7 +32,7 @@ class Refined:
         model: The adjusted model.
         freed: Whether any camera parameter was freed.
         free_principal_points: The ids of the cameras whose principal points were freed.
-        decisions: Sentences for the log.
+        decisions: The sentences for the log.
     """
 
     model: pycolmap.Reconstruction

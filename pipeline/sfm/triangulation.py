@@ -40,7 +40,7 @@ class TriangulationReport:
     Attributes:
         num_points: The number of triangulated points.
         num_images: The number of photographs with a pose.
-        decisions, warnings: Sentences for the log.
+        decisions, warnings: The sentences for the log.
     """
 
     num_points: int

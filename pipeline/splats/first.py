@@ -25,7 +25,7 @@ class InitPoints:
     """The points that Gaussians are initialised from.
 
     Attributes:
-        source: The name of the points' source, for messages.
+        source: The name of the points in messages.
         normals: See ``gaussians_from_points``.
     """
 
@@ -58,7 +58,7 @@ def first_gaussians(
     Args:
         training: The training views, for random initialisation and the scale of the scene.
         seed: The seed of random initialisation.
-        skybox: Whether to add one behind the Gaussians (``pipeline.splats.skybox``).
+        skybox: Whether to add a skybox behind the Gaussians (``pipeline.splats.skybox``).
     """
     points, source = init.points, init.source
     method, warnings = config.method, []

@@ -41,7 +41,7 @@ def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
     if program is None:
         return False
     height, width = frames[0].shape[:2]
-    # One thread and no version strings: the same frames give the same bytes.
+    # Use one thread and no version strings: the same frames give the same bytes.
     command = [
         *(program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
         *("-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-an"),
@@ -55,7 +55,7 @@ def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
 
 def _opencv(path: Path, frames: Frames, fps: int) -> bool:
     height, width = frames[0].shape[:2]
-    # Not WebM, which contains a random number: the same frames give the same bytes.
+    # Avoid WebM, which contains a random number: the same frames give the same bytes.
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
     if not writer.isOpened():
         return False

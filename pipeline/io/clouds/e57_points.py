@@ -108,7 +108,7 @@ def _points(pages: Pages, scan: _Scan) -> Chunks:
         xyz = stacked([read[name] for name in names], np.float64)
         if names is _SPHERICAL:
             xyz = _cartesian(xyz)
-        # einsum, not a matrix product: BLAS may round differently with the number of threads.
+        # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
         xyz = np.einsum("ij,nj->ni", scan.rotation, xyz) + scan.translation
         if state in read:
             xyz = np.where((read[state] == 0)[:, None], xyz, np.nan)

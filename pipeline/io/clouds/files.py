@@ -26,7 +26,7 @@ _FORMATS: dict[str, tuple[Callable[[Path], Chunks], Callable[[Path], int] | None
     ".pts": (read_text, None),
 }
 CLOUD_SUFFIXES = tuple(_FORMATS)
-# Bytes of memory; a tenth of them suffices for files of any size.
+# The limit of memory in bytes; a tenth of them suffices for files of any size.
 _MEMORY = 2 << 30
 # The least time of a file, and the slowest that its bytes are read: a tenth of the usual speed.
 _SECONDS, _BYTES_PER_SECOND = 60, 1 << 20

@@ -19,7 +19,7 @@ from pipeline.io.bounded import opened_regular
 from pipeline.io.clouds.values import Chunk, Chunks, damaged, stacked
 from pipeline.runtime.errors import UserError
 
-# Bytes: what is read at a time, and the longest line.
+# The number of bytes that are read at a time, and those of the longest line.
 _BLOCK, MAX_LINE = 1 << 22, 1 << 16
 _COMMENTS = (b"#", b"//")
 _SEPARATORS = (b";", b",")

@@ -49,12 +49,12 @@ class PoseFormat:
         names: What the names of images refer to. "photos": the folder of the photographs;
             "scene": the scene folder, so that the file lists the photographs; "order": the file
             has no names, its rows are the photographs sorted by name.
-        find: The pose file or folder in a scene folder, relative to it; None without one.
-        files: The files that the poses at a path consist of.
-        summarise: The fields of ``GivenPoses`` except ``kind`` and ``path``.
-        read: The poses of existing photographs; the arguments are the path, photograph -> width and
+        find: Returns the pose file or folder in a scene folder, relative to it; None without one.
+        files: Returns the files that the poses at a path consist of.
+        summarise: Returns the fields of ``GivenPoses`` except ``kind`` and ``path``.
+        read: Reads the poses of existing photographs; the arguments are the path, the width and
             height in pixels, and, for "order", the names of all photographs.
-        frames: The frames at a path; None for formats that have no names or have points.
+        frames: Reads the frames at a path; None for formats that have no names or have points.
     """
 
     kind: PoseKind

@@ -93,7 +93,7 @@ def reconstruct(
     """The frames whose photographs exist.
 
     Args:
-        sizes: The photograph -> width and height in pixels.
+        sizes: The width and height in pixels by photograph.
         file: The pose file, for error messages.
 
     Returns:

@@ -76,7 +76,7 @@ def _lens(file: Path) -> Lens:
     f, px, py, k1, k2, k3, t1, t2 = (
         number(file, name, values.get(name, "0" if name[0] in "KT" else "")) for name in _FIELDS
     )
-    # In sensor widths; multiplied by the photograph's width in pixels.
+    # The values are in sensor widths; they are multiplied by the photograph's width in pixels.
     unit = Brown(
         f / width_mm, f / width_mm, px / width_mm, py / width_mm, k=(k1, k2, k3), p=(t1, t2)
     )

@@ -84,7 +84,7 @@ class PairFinder:
     """Finds pairs of photographs with matches.
 
     Args:
-        photos: Photographs in the order of their names.
+        photos: The photographs in the order of their names.
         cameras: The given cameras of the photographs, which may be wrong.
         centres: (K, N, 3) positions of the photographs according to K readings of the poses, of
             which near ones are tried if the neighbours in the order of names do not match.

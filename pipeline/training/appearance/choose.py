@@ -29,9 +29,9 @@ class AppearanceChoice:
     """How the colours of photographs differ.
 
     Attributes:
-        gains: Exposure gains of all views; empty if exposure is not modelled.
+        gains: The exposure gains of all views; empty if exposure is not modelled.
         embeddings: Whether views have appearance embeddings.
-        decisions: Sentences for the user.
+        decisions: The sentences for the user.
         counters: The measured values, by the name of its counter.
     """
 

@@ -43,8 +43,8 @@ class Shown:
     """Constant SH coefficients (N, 3) while a photograph is rendered.
 
     Attributes:
-        own: The colours of the scene.
-        shown: The colours in the photograph.
+        own: The coefficients of the scene.
+        shown: The coefficients in the photograph.
     """
 
     own: Tensor
@@ -143,7 +143,7 @@ def appearance_gradients(
     (N, 3). The colour of a Gaussian is linear in SH coefficient 0, with the factor ``SH_C0``."""
     weights = torch.from_numpy(embedding).float() * SH_C0
     d_appearance = d_colors[:, None] * weights[:, None]
-    # In float64 and by numpy, whose sums do not depend on the number of threads.
+    # Use float64 and numpy, whose sums do not depend on the number of threads.
     d_offsets = d_colors.numpy().astype(np.float64) * SH_C0
     products = (appearance[:, number].numpy() * d_offsets for number in range(len(embedding)))
     return np.array([np.sum(product) for product in products]), d_appearance

@@ -91,7 +91,7 @@ def fit_embedding(
             (render(embedding + step) - now) / step.sum()
             for step in np.diag(DIFFERENCE * deviations)
         ]
-        # Not matrix products: BLAS may round differently with the number of threads.
+        # Avoid matrix products: BLAS may round differently with the number of threads.
         normal = np.array([[np.sum(a * b) for b in slopes] for a in slopes])
         right = np.array([np.sum(a * (target - now)) for a in slopes])
         embedding = embedding + np.linalg.solve(normal + np.diag(prior), right - prior * embedding)

@@ -26,7 +26,7 @@ def initial_embeddings(views: Sequence[View], size: int) -> Array:
     """
     statistics = np.array([_statistics(view) for view in views])
     statistics -= statistics.mean(0)
-    # Not a matrix product: BLAS may round differently with the number of threads.
+    # Avoid a matrix product: BLAS may round differently with the number of threads.
     covariance = np.einsum("vi,vj->ij", statistics, statistics) / len(views)
     variances, axes = np.linalg.eigh(covariance)
     axes = axes[:, ::-1][:, :size]

@@ -35,7 +35,7 @@ class BlockLayers:
     Attributes:
         coarse: The Gaussians of the whole scene before the blocks are trained.
         partition, number: The block.
-        corrects: The model that splits an error into the block's part and the rest.
+        corrects: The box whose Gaussians explain the part of an error that the block corrects.
         background: The background behind the scene.
         options: The options of training, without a background.
         gains: The exposure gains of the views, by which renders are multiplied before they are
@@ -70,7 +70,7 @@ class BlockLayers:
         rendered = self.backend.forward_subsets(
             self.coarse.parameters(), raster_camera(view), self.options, layers
         )
-        # One after the other, without what else was rendered with each image.
+        # Render one after the other, and keep only the image of each.
         images = ((found.color, found.alpha) for found in rendered)
         front, transmittance = _front(*next(images))
         block, block_alpha = next(images)

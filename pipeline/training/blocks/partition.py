@@ -60,9 +60,9 @@ class PartitionOptions:
         axes: (3, 3) float64, directions of the faces as rows, orthonormal.
         max_gaussians: The upper limit of the number of Gaussians of a block that fills its views.
         view_pixels: The number of pixels of a typical view.
-        pixels_per_gaussian: Training pixels of all views together for a Gaussian.
+        pixels_per_gaussian: The number of training pixels of all views together per Gaussian.
         steps: The number of steps of one block for the whole scene.
-        raster: Options of rendering, with near plane and antialiasing of the training.
+        raster: The options of rendering, with the near plane and antialiasing of the training.
     """
 
     blocks: int
@@ -120,7 +120,7 @@ def _axes(points: Array, up: Array) -> Array:
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     flat = np.stack([first, np.cross(up, first)])
-    # einsum, not a matrix product: BLAS may round differently with the number of threads.
+    # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
     local = np.einsum("ij,nj->ni", flat, points)
     local = np.clip(local, *np.quantile(local, EXTENT_QUANTILES, axis=0))
     local -= local.mean(0)

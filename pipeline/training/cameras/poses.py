@@ -68,7 +68,7 @@ class PoseRefinement:
         change = self.adam.step(index, np.concatenate([turn, shift * self.extent]), rate)
         left = rigid(change[:3], change[3:] * self.extent + pivot)
         left[:3, 3] -= (left[:3, :3] * pivot).sum(1)
-        # Not a matrix product: BLAS may round differently with the number of threads.
+        # Avoid a matrix product: BLAS may round differently with the number of threads.
         self.poses[index] = (left[:, :, None] * self.poses[index][None]).sum(1)
 
     def arrays(self) -> dict[str, NDArray[Any]]:

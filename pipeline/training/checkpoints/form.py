@@ -18,7 +18,7 @@ Arrays = Mapping[str, NDArray[Any]]
 _HARMONICS = "sh"
 _BANDS = (1, 4, 9, 16)
 _ROWS = ("parameter.", "first.", "second.")
-# One number a Gaussian, or none before the first step of density control.
+# These arrays have one number a Gaussian, or none before the first step of density control.
 _STATISTICS = frozenset({"gradient_sum", "seen"})
 
 

@@ -43,7 +43,7 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
     observed = model.observed_points(view.name for view in views)
     found = []
     for view, here in zip(views, observed, strict=True):
-        # einsum, not a matrix product: BLAS may round differently with the number of threads.
+        # Use einsum, not a matrix product: BLAS may round differently with the number of threads.
         camera = np.einsum("ij,nj->ni", view.world_to_camera[:3, :3], points.xyz[here])
         camera += view.world_to_camera[:3, 3]
         z = camera[:, 2]

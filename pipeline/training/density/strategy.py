@@ -26,9 +26,9 @@ class Changes:
     """The numbers of Gaussians that density control has changed.
 
     Attributes:
-        cloned, split: Gaussians that were cloned or split.
-        relocated: Useless Gaussians that were moved onto others.
-        pruned: Gaussians that were removed.
+        cloned, split: The number of Gaussians that were cloned or split.
+        relocated: The number of useless Gaussians that were moved onto others.
+        pruned: The number of Gaussians that were removed.
     """
 
     cloned: int = 0

@@ -15,7 +15,7 @@ from pipeline.config.settled import TrainOptions
 NOMINAL_STEPS = 7000
 # The mean of a gradient over fewer steps than this is too noisy.
 MIN_INTERVAL = 10
-# Without densification afterwards, pruned Gaussians are not replaced in the rest of the run.
+# If densification has ended, pruned Gaussians are not replaced in the rest of the run.
 PRUNE_UNTIL = 0.9
 
 

@@ -23,7 +23,7 @@ class TrainResult:
     Attributes:
         gaussians: The Gaussians with SH of the configured degree, in the colours of the mean
             photograph.
-        curve: The records of the metrics log, deterministic.
+        curve: The training curve, which is deterministic.
         curve_seconds: The training time of each record; differs between runs.
         counters: The totals of the run (``state.Counters``).
         near: The near plane of the training, world units; renders need the same.

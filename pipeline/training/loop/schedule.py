@@ -96,7 +96,7 @@ class Schedule:
         """The learning rates of a step.
 
         Args:
-            warm_up: The factor of all of them.
+            warm_up: The factor that multiplies all learning rates.
             run_length: The number of optimiser steps of the whole run, or its estimate.
             unit: The unit of the means' learning rate, world units; 1 for each Gaussian's own
                 scales.

@@ -27,13 +27,14 @@ class Counters:
     """Totals of the run.
 
     Attributes:
-        changes: The totals of density control.
+        changes: The changes by density control.
         opacity_resets: The number of opacity resets.
         max_gaussians: The largest number of Gaussians.
-        num_dropped: Gaussians that the rasterizer left out for numerical reasons, over all steps.
+        num_dropped: The number of Gaussians that the rasterizer left out for numerical reasons,
+            over all steps.
         blind_steps: The number of steps whose view saw no Gaussian.
-        unseen: Gaussians removed at the end because no training view saw them.
-        floaters: Gaussians removed because they were close to a single camera.
+        unseen: The number of Gaussians removed at the end because no training view saw them.
+        floaters: The number of Gaussians removed because they were close to a single camera.
     """
 
     changes: Changes = field(default_factory=Changes)

@@ -57,7 +57,7 @@ class MatchingScene:
         """The photographs in the order of their names, with ids from 1.
 
         Args:
-            focals: The initial focal length of fisheye lenses without a prior by camera id, in pixels.
+            focals: The initial focal length in pixels by camera id, for fisheyes without a prior.
         """
         cameras, camera_of = plan_cameras(self.manifest, self.sharing)
         for camera in cameras:

@@ -29,8 +29,7 @@ def fit_camera(
         model: The model of the camera that is returned.
         width, height: The image size in pixels.
         start: The parameters to start from, near those of ``lens``.
-        lens: The function from normalised coordinates (x / z, y / z), (..., 2), to pixels, (...,
-            2).
+        lens: The map from normalised coordinates (x / z, y / z), (..., 2), to pixels, (..., 2).
 
     Returns:
         The camera and the largest error over the image in pixels: infinity if ``lens`` has no

@@ -50,7 +50,7 @@ class Convention:
 
     Attributes:
         rotation: The direction of its rotation.
-        position: Whether it has the camera's centre, or the translation of world to camera.
+        position: Whether the file has the camera's centre, or the translation of world to camera.
         axes: (3, 3) from the axes of its cameras to COLMAP's.
     """
 

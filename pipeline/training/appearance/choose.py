@@ -32,7 +32,7 @@ class AppearanceChoice:
         gains: The exposure gains of all views; empty if exposure is not modelled.
         embeddings: Whether views have appearance embeddings.
         decisions: The sentences for the user.
-        counters: The measured values, by the name of its counter.
+        counters: The measured values by the names of their counters.
     """
 
     gains: ExposureGains = NO_GAINS

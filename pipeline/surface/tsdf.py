@@ -48,7 +48,8 @@ class Grid:
     Attributes:
         voxel: The side of a voxel, world units. Voxel (i, j, k) has its centre at (i, j, k) *
             voxel.
-        far: The largest depth of a surface, world units. Beyond it, space up to ``far`` is free.
+        far: The largest depth that counts as a surface, world units. A greater one proves only that
+            the space up to ``far`` is free.
         blocks: (B, 3) int64, sorted; block b holds voxels b * 8 to b * 8 + 7.
     """
 

@@ -1,7 +1,7 @@
 """Everything of Snakemake that this program reads or changes and that Snakemake does not document.
 
-``tests/stages/test_internals.py`` and ``tests/cluster/test_executor.py`` have a contract test of each
-part. The page ``docs/explanation/snakemake.md`` says what each part is for.
+``tests/stages/test_internals.py`` and ``tests/cluster/test_executor.py`` have a contract test of
+each part. The page ``docs/explanation/snakemake.md`` says what each part is for.
 """
 
 from __future__ import annotations

@@ -27,6 +27,8 @@ from pipeline.runtime.text import is_plain
 # other programs.
 _TEXTS = frozenset({"readme", "license", "licence", "copying", "notice", "source", "citation"})
 _SIDE_CARS = frozenset({".md", ".thm", ".lrv", ".xmp", ".aae", ".pp3", ".dop", ".db", ".ini"})
+# What a synthetic scene was made from.
+_SPECS = frozenset({"demo.json", "town.json"})
 _COPIES = frozenset({"images", "images_2", "images_4", "images_8"})
 
 _MODEL = re.compile(r"(cameras|images|points3d|frames|rigs)\.(bin|txt|ply)", re.IGNORECASE)
@@ -134,7 +136,7 @@ class Inventory:
         """A warning for each kind of files that are not used, with their number and first names.
 
         Files that are not for reconstruction have no warning: hidden ones, texts, side-cars,
-        previews, and reduced copies of the photographs.
+        previews, reduced copies of the photographs, and the truth of a scene.
 
         Raises:
             OSError: The scene folder cannot be read.
@@ -187,6 +189,8 @@ class Inventory:
             return "names"
         if is_pose_file:
             return "poses"
+        if path.as_posix() in _SPECS or (path.parts[0] == "depth_gt" and suffix in DEPTHS.suffixes):
+            return None
         if _MODEL.fullmatch(name):
             own = self.poses is not None and path.parent.as_posix() == self.poses.path
             return None if own or path.parent.name == "sparse_gt" else "models"

@@ -28,6 +28,7 @@ from pipeline.photos.load import load_mask, load_rgb, load_rgba
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
+from tests.plan.scans import look
 
 SPEC = DemoSpec(
     views=4, width=160, height=120, format="png", distortion="opencv", poses="colmap", seed=3
@@ -59,6 +60,12 @@ def to_world(camera: Camera, view: PosedImage, xy: np.ndarray, z: np.ndarray) ->
 def to_view(camera: Camera, view: PosedImage, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     local = xyz @ view.rotation.T + view.translation
     return project(camera, local[..., :2] / local[..., 2:]), local[..., 2]
+
+
+def test_the_plan_knows_every_file_of_the_scene(folder: Path) -> None:
+    """The truth and the specification are no inputs, and nobody has to be warned of them."""
+    found = look(folder)
+    assert found.unused == () and len(found.photos) == 4
 
 
 def test_depth_reprojects_one_view_onto_another(folder: Path) -> None:

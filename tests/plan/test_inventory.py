@@ -15,6 +15,7 @@ from PIL import Image
 
 from pipeline.io import walk as walks
 from pipeline.io.colmap import read_model, write_model
+from pipeline.io.companions import DEPTHS
 from pipeline.io.names import PHOTO_SUFFIXES, first_names, suffix_of
 from pipeline.plan.inventory import _SIDE_CARS, _TEXTS
 from pipeline.runtime.errors import UserError
@@ -43,7 +44,7 @@ FOLDERS = st.sampled_from([
     ".", "images", "images/a", "images_2", "input", "orig", "color", "keyframes", "a/b/c", "Köln",
     unicodedata.normalize("NFD", "Köln"), "masks", "masks/b", "mask", "Masks", "Masken",
     "segmentation", "images/masks", "depths", "depth", "sparse", "sparse/0", "sparse/1",
-    "colmap/sparse/0", "distorted/sparse/0", "sparse_gt", "videos", "points",
+    "colmap/sparse/0", "distorted/sparse/0", "sparse_gt", "depth_gt", "videos", "points",
 ])
 STEMS = st.one_of(
     st.sampled_from([
@@ -89,6 +90,7 @@ def is_no_input(path: PurePosixPath) -> bool:
         or (path.parts[0] == "images_2" and suffix_of(path.name) in PHOTO_SUFFIXES)
         # Parts of the COLMAP model that is used, and ground truth.
         or (path.parts[0] == "sparse_gt" and path.stem in MODEL_STEMS)
+        or (path.parts[0] == "depth_gt" and suffix_of(path.name) in DEPTHS.suffixes)
         or (path.parent.as_posix() == "sparse/0" and path.stem in ("rigs", "frames"))
         or path.as_posix() == "sparse/0/points3D.ply"
     )
@@ -166,7 +168,7 @@ def test_each_kind_is_named_with_its_reason(tmp_path):
 def test_files_that_are_not_for_reconstruction_are_no_warning(tmp_path):
     photos(tmp_path / "images", 3)
     photos(tmp_path / "images_2", 3)
-    for name in ("README.txt", "LICENSE", "SOURCE.md", ".DS_Store", "Thumbs.db", "images/p00.xmp"):
+    for name in ("README.txt", "LICENSE", ".DS_Store", "Thumbs.db", "images/p00.xmp", "demo.json"):
         (tmp_path / name).write_text("text")
     assert look(tmp_path).warnings == ()
 

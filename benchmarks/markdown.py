@@ -27,7 +27,7 @@ def middle(values: Sequence[float], form: str) -> str:
     """The median, and of several values half their range.
 
     Args:
-        form: format string, such as "{:.2f}".
+        form: The format string, such as "{:.2f}".
     """
     median = form.format(statistics.median(values))
     if len(values) == 1:

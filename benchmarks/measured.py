@@ -29,15 +29,16 @@ class Measured(BaseModel):
     """What a benchmark measured on, and how.
 
     Attributes:
-        benchmark: its module, without ``benchmarks.``.
+        benchmark: The name of its module, without ``benchmarks.``.
         command: the command that repeats the measurement.
         note: the protocol, or other programs that were running.
-        date: of the end, ISO 8601.
-        commit: of the checkout; None where it is unknown.
-        cores: logical ones. memory_mb: MiB.
-        load_average: of the last minute; None if the system does not provide it.
+        date: The date of the end, ISO 8601.
+        commit: The commit of the checkout; None if it is unknown.
+        cores: The number of logical cores.
+        memory_mb: The memory, MiB.
+        load_average: The load of the last minute; None if the system does not provide it.
         instruction_set: the target of the rasterizer's library.
-        compiler: that compiled it, with its version.
+        compiler: The compiler that compiled it, with its version.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -74,7 +75,7 @@ def measured(benchmark: str, note: str, arguments: Sequence[str] | None = None) 
     """Facts about this machine, checkout and command.
 
     Args:
-        arguments: of the command line; None for this process's.
+        arguments: The arguments of the command line; None for this process's.
     """
     build.library().build()  # Child processes may have used the library, and this one not.
     return Measured(

@@ -31,11 +31,11 @@ class Mutant:
     """One fault.
 
     Attributes:
-        file: relative to the project.
-        old: text to replace; occurs exactly once.
-        new: replacement.
-        what: description of the fault.
-        tests: files or folders; at least one of their tests must fail.
+        file: The path of the file, relative to the project.
+        old: The text to replace, which occurs exactly once.
+        new: The replacement.
+        what: The description of the fault.
+        tests: Files or folders of tests, of which at least one must fail.
     """
 
     file: str

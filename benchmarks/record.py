@@ -51,7 +51,7 @@ def scene_record(
     """What runs of one scene measured, as stored.
 
     Args:
-        training: preset, or what else names the training in tables.
+        training: The preset, or what else names the training in tables.
 
     Raises:
         NotComparable: the runs are of several scenes, commits, machines or protocols.

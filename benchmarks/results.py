@@ -112,13 +112,13 @@ class StabilityResult:
     Attributes:
         what: the case in words.
         code: Snakemake's exit code.
-        psnr, ssim: of test views; None if the run failed.
+        psnr, ssim: The means over the test views; None if the run failed.
         reference: the case whose quality it should have, if any.
         difference_db: PSNR minus that of the reference; None where either is unknown.
-        gaussians: final number.
-        message: of the error, or the warnings of the result.
-        traceback: whether a traceback was printed.
-        right: whether the outcome is the expected one.
+        gaussians: The final number of Gaussians.
+        message: The message of the error, or the warnings of the result.
+        traceback: Whether a traceback was printed.
+        right: Whether the outcome is the expected one.
     """
 
     case: str
@@ -142,10 +142,10 @@ class StressResult:
     """A family of inputs.
 
     Attributes:
-        cases, drawn, dropped: numbers of Gaussians.
-        not_finite: number of values of images and gradients that are not finite.
-        colour: see ``benchmarks.raster_stress.Tally``.
-        gradient_median, gradient_p99, gradient_worst: relative errors over calls.
+        cases, drawn, dropped: The numbers of Gaussians.
+        not_finite: The number of values of images and gradients that are not finite.
+        colour: See ``benchmarks.raster_stress.Tally``.
+        gradient_median, gradient_p99, gradient_worst: The relative errors over calls.
     """
 
     family: str
@@ -167,10 +167,10 @@ class GpuResult:
     """A scene on a GPU, and on the processor of the same machine.
 
     Attributes:
-        phase_ms: time of the kernels of each phase of a training step, by the device's timestamps.
-        step_ms, cpu_step_ms: wall time of a step.
-        frames_per_s, cpu_frames_per_s: of rendering alone, with the copy of the image.
-        bandwidth: bytes per second that copies inside the device's memory read and write.
+        phase_ms: The time of the kernels of each phase of a step, by the device's timestamps.
+        step_ms, cpu_step_ms: The wall time of a step.
+        frames_per_s, cpu_frames_per_s: The rate of rendering alone, with the copy of the image.
+        bandwidth: The bytes per second that copies inside the device's memory read and write.
         moments_bandwidth: bytes of SH coefficients and moments over the time of the kernel that
             updates them.
     """
@@ -198,15 +198,15 @@ class BlocksResult:
     """A scene as one block, and in blocks; pairs are in this order.
 
     Attributes:
-        run: name of the run as one block.
-        seed: of both.
-        pixels: width and height of a view.
-        psnr, ssim: of the test views.
-        gaussians: numbers of trained Gaussians.
-        training_rss_mb: largest memory of a job of training, MiB.
-        peak_rss_mb: largest memory of any job, MiB.
-        training_cpu_s: CPU seconds of all training jobs.
-        largest_block_cpu_s: of the block that takes longest.
+        run: The name of the run as one block.
+        seed: The seed of both.
+        pixels: The width and height of a view.
+        psnr, ssim: The means over the test views.
+        gaussians: The numbers of trained Gaussians.
+        training_rss_mb: The largest memory of a job of training, MiB.
+        peak_rss_mb: The largest memory of any job, MiB.
+        training_cpu_s: The CPU seconds of all training jobs.
+        largest_block_cpu_s: The CPU seconds of the block that takes longest.
         seam_gradient: mean gradient of the error images of the test views across the seams of the
             blocks, divided by that elsewhere. The first run has no seams: its value is that of
             what the photographs show there.
@@ -241,10 +241,10 @@ class ScalingResult:
     """A stage of a run, or stages that together do what one does in a small scene.
 
     Attributes:
-        cpu_s: CPU seconds of all its jobs.
-        largest_cpu_s: of the job that takes most.
-        peak_rss_mb: largest memory of a job, MiB.
-        output_mb: size of the files that it leaves, MB.
+        cpu_s: The CPU seconds of all its jobs.
+        largest_cpu_s: The CPU seconds of the job that takes most.
+        peak_rss_mb: The largest memory of a job, MiB.
+        output_mb: The size of the files that it leaves, MB.
     """
 
     run: str
@@ -265,13 +265,13 @@ class SlurmResult:
     """A scene on a Slurm cluster.
 
     Attributes:
-        nodes: number of nodes, with one core each.
-        blocks: number of the scene's.
-        jobs: number of submissions.
-        wall_s: from the start of Snakemake to its end.
-        busy_s: seconds in which at least one job runs.
-        blocks_s: from the start of the first job that trains or polishes a block to the end of the
-            last one; None if the scene is one block.
+        nodes: The number of nodes, with one core each.
+        blocks: The number of the scene's blocks.
+        jobs: The number of submissions.
+        wall_s: The seconds from the start of Snakemake to its end.
+        busy_s: The seconds in which at least one job runs.
+        blocks_s: The time from the start of the first job that trains or polishes a block to the
+            end of the last one; None if the scene is one block.
     """
 
     scene: str
@@ -335,8 +335,8 @@ class PoseResult:
 
     Attributes:
         program: the format; empty for the scene's own file.
-        mistake: empty for right poses.
-        text: what was said.
+        mistake: The name of the mistake; empty for right poses.
+        text: What was said.
         seconds: the time of plan and comparison; features and matches are computed once a scene.
     """
 

@@ -30,7 +30,7 @@ def stage_results(folder: Path, only: Collection[str] = ()) -> list[ScalingResul
     """Each stage of a run, without stages that have not finished.
 
     Args:
-        only: names of stages; if empty, all stages, those of ``STEPS`` together.
+        only: The names of stages; if empty, all stages, those of ``STEPS`` together.
     """
     plan = read_plan(folder)
     step_of = {stage: step for step, stages in STEPS.items() for stage in stages if not only}

@@ -65,8 +65,8 @@ class Cluster:
     """A running cluster.
 
     Attributes:
-        folder: its configuration, state and logs.
-        environment: variables with which Slurm's commands find it.
+        folder: The folder of its configuration, state and logs.
+        environment: The variables with which Slurm's commands find it.
         controllers: the running one's supervisor.
     """
 
@@ -78,7 +78,7 @@ class Cluster:
         """Run a program of Slurm and return what it prints.
 
         Args:
-            check: run it again until it succeeds, for a minute: the controller may be starting.
+            check: Whether to repeat it for a minute until it succeeds, while the controller starts.
         """
         end = time.monotonic() + 60
         while True:
@@ -151,8 +151,8 @@ def running(folder: Path, nodes: int = 2, memory_mb: int = 6000) -> Iterator[Clu
     """A cluster that ends with the block.
 
     Args:
-        folder: absolute; short, because sockets are in it.
-        memory_mb: of each node.
+        folder: An absolute path; short, because sockets are in it.
+        memory_mb: The memory of each node.
     """
     for name in ("munge", "state", "spool"):
         (folder / name).mkdir(parents=True)

@@ -187,7 +187,7 @@ def read_record(name: str) -> Record:
     """A record of ``RECORDS``.
 
     Raises:
-        UserError: it is missing, or not JSON.
+        UserError: It is missing, or not JSON.
     """
     try:
         record: Record = json.loads((RECORDS / name).read_text())

@@ -80,7 +80,7 @@ def options_of(values: Sequence[str]) -> dict[str, Any]:
     """The configuration of ``NAME=VALUE`` arguments, whose values are YAML.
 
     Raises:
-        UserError: an argument without "=", a value that is no YAML, or a budget.
+        UserError: An argument has no "=", or its value is no YAML.
     """
     found: dict[str, Any] = {}
     for text in values:

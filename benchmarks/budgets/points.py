@@ -32,9 +32,10 @@ class Setup:
     """How the product is run.
 
     Attributes:
-        data: folder of the scene folders. work: folder for ``results/``.
+        data: The folder of the scene folders.
+        work: The folder for ``results/``.
         options: the configuration besides the time budget.
-        cores: number of cores.
+        cores: The number of cores.
     """
 
     data: Path
@@ -82,7 +83,7 @@ def measured_point(setup: Setup, scene: str, seed: int, minutes: float) -> Budge
     """The result of a finished run.
 
     Raises:
-        UserError: it was trained in blocks, whose times are not those of one training.
+        UserError: It was trained in blocks, whose times are not those of one training.
     """
     results = setup.results(scene, seed, minutes)
     if not (results / "train" / "run.json").is_file():
@@ -121,7 +122,7 @@ class Points:
 
     Attributes:
         path: the record.
-        facts: those of this machine and checkout; the command is that of all points.
+        facts: The facts of this machine and checkout; the command is that of all points.
     """
 
     def __init__(self, path: Path, facts: Measured) -> None:
@@ -155,7 +156,7 @@ class Points:
         """The finished point, or None.
 
         Raises:
-            UserError: it was measured with other options.
+            UserError: It was measured with other options.
         """
         for point in self.points:
             if (point.scene, point.seed, point.minutes) != (scene, seed, minutes):

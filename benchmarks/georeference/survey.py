@@ -33,10 +33,10 @@ class Survey:
     """A survey.
 
     Attributes:
-        origin: latitude, longitude (degrees) and height (metres) of the origin of ``enu``.
+        origin: The latitude, longitude (degrees) and height (metres) of the origin of ``enu``.
         enu: (N, 3) camera centres, metres east, north and up.
         rotations: (N, 3, 3) from east, north, up to the camera.
-        model: from the frame of structure from motion to east, north, up.
+        model: The similarity from the frame of structure from motion to east, north, up.
     """
 
     origin: Array

@@ -57,8 +57,8 @@ def grade(
     Args:
         truths: of the scenes that were photographed; the model is of the one it has most views of,
             and its views of the others are wrong.
-        total: photographs.
-        depth: typical distance of what the cameras saw, in the truth's unit; None where unknown.
+        total: The number of photographs.
+        depth: The typical distance of what the cameras saw, in the truth's unit; None if unknown.
     """
     if estimated is None:
         return Truth("failed", 0.0, 0, None, None)

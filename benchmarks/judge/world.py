@@ -66,13 +66,13 @@ class Shot:
     """One photograph.
 
     Attributes:
-        rotation, centre: true pose, world to camera.
-        scene: index of the visible scene.
+        rotation, centre: The true pose, world to camera.
+        scene: The index of the visible scene.
         mirrored: the photograph is flipped horizontally.
-        prior: focal length in EXIF over the true one; None without EXIF.
-        blur: additional noise of the keypoints, pixels.
-        copy_of: index of the photograph that this is a copy of.
-        camera: photographs with equal numbers share a camera.
+        prior: The focal length in EXIF over the true one; None without EXIF.
+        blur: The additional noise of the keypoints, pixels.
+        copy_of: The index of the photograph that this is a copy of.
+        camera: The number of the camera; photographs with equal numbers share one.
     """
 
     rotation: Array
@@ -143,7 +143,7 @@ class Written:
     Attributes:
         truths: cameras of each scene, and of each mirrored scene: a model can contain only
             one of them.
-        depth: median distance of the visible points.
+        depth: The median distance of the visible points.
     """
 
     manifest: Manifest

@@ -52,8 +52,8 @@ class Program:
 
     Attributes:
         name: the program, as in tables.
-        write: writes its file of poses into a scene folder, with one mistake.
-        named: what the message says about each mistake, as regular expressions.
+        write: The function that writes its pose file into a scene folder, with one mistake.
+        named: What the message says about each mistake, as regular expressions.
     """
 
     name: str

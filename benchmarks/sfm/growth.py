@@ -59,7 +59,7 @@ def make_database(path: Path, count: int, points: int) -> None:
     """Verified matches between each camera and the next five.
 
     Args:
-        points: approximate number per photograph.
+        points: The approximate number of points per photograph.
     """
     import pycolmap
 

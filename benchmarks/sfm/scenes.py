@@ -30,8 +30,8 @@ class Scene:
     """Photographs and their true poses.
 
     Attributes:
-        scan: of the photographs to be used, as if no poses were given.
-        truth: poses of these photographs alone.
+        scan: The scan of the photographs to be used, as if no poses were given.
+        truth: The poses of these photographs alone.
         truth_kind: "truth" from ``sparse_gt``, or "given poses", themselves a reconstruction.
     """
 

@@ -54,11 +54,11 @@ class Summary:
     """Medians over the runs of a configuration on a scene, of those that gave a model.
 
     Attributes:
-        cpu_s: of each step; ``total_s`` their sum.
+        cpu_s: The CPU seconds of each step; ``total_s`` is their sum.
         rotation_deg, centre, centre_permille, auc1: median errors over the images in degrees,
             the world's unit and thousandths of the cameras' radius; area under the curve of
             relative pose errors up to one degree. None without any model.
-        runs, failed: how many, and how many of them without a model.
+        runs, failed: The number of runs, and of those without a model.
     """
 
     scene: str

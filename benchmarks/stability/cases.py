@@ -43,11 +43,11 @@ class Case:
     Attributes:
         make: writes the scene into a folder that is there and empty; its second argument is the
             room as everybody photographs it, with poses and points.
-        what: for the table.
+        what: The description for the table.
         expected: "same": quality is the reference's within ``__main__.TOLERANCE_DB``; "works":
             a result, with a PSNR of at least ``least``; "error": one clear message.
         reference: the case whose quality it should have.
-        config: beside the tiny run's.
+        config: The options beside the tiny run's.
     """
 
     make: Callable[[Path, Path], None]
@@ -168,9 +168,9 @@ def taken(
     """Photographs taken from ``centres`` (N, 3) towards ``targets`` (N, 3).
 
     Args:
-        given: poses and the room's points come along.
-        focal: times the room's own.
-        told_focal: what the given cameras say instead, pixels.
+        given: Whether poses and the room's points come along.
+        focal: The focal length, in units of the room's own.
+        told_focal: The focal length that the given cameras say instead, pixels.
         alone: the objects before black instead of the room, which ends 3.5 from its middle.
     """
 

@@ -36,7 +36,7 @@ class Ground:
     """The ground's appearance.
 
     Attributes:
-        map: shares of sun, sky, paving and town at each place, of 255.
+        map: The shares of sun, sky, paving and town at each place, of 255.
         corner: (2,) its lower left corner; ``texel`` its resolution, metres.
         noise: the periodic tile.
     """

@@ -29,10 +29,10 @@ class Plot:
     """Where a house stands.
 
     Attributes:
-        x, y: its middle, metres.
-        width, depth: along the street, and across it.
+        x, y: The middle, metres.
+        width, depth: The extent along the street, and across it.
         front: +1 where the street is at smaller y, -1 where it is at larger y.
-        yaw: radians.
+        yaw: The direction, radians.
     """
 
     x: float

@@ -31,8 +31,8 @@ class Town:
     """The solids of a town and its paved ground.
 
     Attributes:
-        cells: in the order of the photographs.
-        solids: houses, trees, cars and all else that stands on the ground.
+        cells: The cells, in the order of the photographs.
+        solids: The houses, trees, cars and all else that stands on the ground.
         paved: (K, 2) corners of convex polygons: paths, drives and squares.
     """
 
@@ -112,8 +112,8 @@ class _Lot:
     """A stretch of one side of a street.
 
     Attributes:
-        left, width: along x.
-        street: y of the street's middle.
+        left, width: The extent along x.
+        street: The y of the street's middle.
         front: +1 on the side of larger y, else -1.
     """
 

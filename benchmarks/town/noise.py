@@ -22,7 +22,7 @@ def fractal(
     """(height, width) sum of octaves of smooth noise, of about zero mean and unit deviation.
 
     Args:
-        finest, coarsest: shortest and longest distance between the noise's nodes, texels.
+        finest, coarsest: The shortest and longest distance between the noise's nodes, texels.
     """
     total = np.zeros((height, width), np.float32)
     variance, step = 0.0, coarsest

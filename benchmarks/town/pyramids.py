@@ -41,8 +41,8 @@ class Pyramid:
         """(N, K) values at (N,) positions.
 
         Args:
-            x, y: texels of level 0 from the image's corner; clamped unless ``periodic``.
-            level: binary logarithm of the filter's width in texels.
+            x, y: The texels of level 0 from the image's corner; clamped unless ``periodic``.
+            level: The binary logarithm of the filter's width in texels.
         """
         level = np.clip(level, 0.0, np.float32(len(self.left) - 1.001))
         low = level.astype(np.intp)

@@ -25,11 +25,11 @@ class Face:
 
     Attributes:
         normal: (3,) outward unit normal.
-        offset: points of the plane satisfy normal . x = offset.
+        offset: The number for which points of the plane satisfy normal . x = offset.
         origin: (3,) top left corner of the texture, seen from outside.
         right, down: (3,) unit vectors of the texture's axes.
-        width, height: metres covered by the texture.
-        finish: what is painted on it.
+        width, height: The metres covered by the texture.
+        finish: What is painted on it.
     """
 
     normal: Array
@@ -47,7 +47,7 @@ class Prism:
     """A convex solid: the intersection of the half-spaces of its faces.
 
     Attributes:
-        faces: its planes.
+        faces: Its planes.
         vertices: (V, 3).
     """
 
@@ -60,9 +60,9 @@ class Ellipsoid:
     """An ellipsoid with axes along the world's, for crowns of trees and shrubs.
 
     Attributes:
-        centre, radii: metres.
-        colour: linear RGB albedo.
-        seed: offset of its texture.
+        centre, radii: The centre and the radii, metres.
+        colour: The linear RGB albedo.
+        seed: The offset of its texture.
     """
 
     centre: Triple
@@ -100,8 +100,8 @@ def prism(
     """A convex polygon, extruded.
 
     Args:
-        profile: corners in the plane of the frame's first two axes, in either order.
-        length: along the third axis, from the frame's origin.
+        profile: The corners in the plane of the frame's first two axes, in either order.
+        length: The extent along the third axis, from the frame's origin.
         finish: the finish of a face by its outward normal.
     """
     corners = np.array(profile, np.float64)

@@ -59,8 +59,8 @@ class Capture:
     """A town and a lens, prepared for photographs.
 
     Attributes:
-        fine, centres: rays as in ``pipeline.demo.render.Rays``; ``fine`` in single precision.
-        focal: pixels.
+        fine, centres: The rays as in ``pipeline.demo.render.Rays``; ``fine`` in single precision.
+        focal: The focal length, pixels.
     """
 
     shapes: Shapes
@@ -125,7 +125,7 @@ class _Hit:
     """Hits of rays: (N,) ``x`` and ``y`` of the ray in the camera's frame, and inverse depths.
 
     Attributes:
-        pixel: width of the texture filter at unit depth.
+        pixel: The width of the texture filter at unit depth.
     """
 
     posed: PosedImage

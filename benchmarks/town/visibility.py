@@ -67,8 +67,8 @@ class Hits:
     Attributes:
         inverse: (R, C) inverse depth; 0 where there is nothing but sky.
         label: (R, C) SKY, GROUND, or 2 and more: the index + 2 into ``seen``.
-        seen: solids, and the face of each (0 of ellipsoids).
-        tests: number of pairs of a ray and a solid that were compared.
+        seen: The solids, and the face of each (0 of ellipsoids).
+        tests: The number of pairs of a ray and a solid that were compared.
     """
 
     inverse: NDArray
@@ -82,7 +82,7 @@ class Shapes:
     """The solids of a town, with the corners of all of them in one array.
 
     Attributes:
-        solids: in any order.
+        solids: The solids, in any order.
         corners: (S, V, 3), short lists filled with their last corner.
     """
 
@@ -225,7 +225,7 @@ class _Quadric:
     Attributes:
         axes: (3, 3) the components of a ray in that frame as weights of (x, y, 1).
         towards: (3,) minus the product of the camera's position with a ray, as weights.
-        gap: squared distance of the camera from the centre, minus 1.
+        gap: The squared distance of the camera from the centre, minus 1.
     """
 
     axes: Array

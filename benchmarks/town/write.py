@@ -53,11 +53,11 @@ class TownSpec:
 
     Attributes:
         photographs: the town's area is proportional to their number.
-        width, height: pixels.
-        distortion: one of ``LENS_CHOICES``.
-        order: names and times along the camera path, or "scattered" at random.
-        poses: poses given as an input: "none", "colmap" (sparse/0) or "transforms" (.json).
-        seed: another seed, another town.
+        width, height: The size in pixels.
+        distortion: One of ``LENS_CHOICES``.
+        order: The order of names and times: along the camera path, or "scattered" at random.
+        poses: The poses given as an input: "none", "colmap" (sparse/0) or "transforms" (.json).
+        seed: The seed of the town.
     """
 
     photographs: int = 60
@@ -96,10 +96,10 @@ def write_town(folder: Path, spec: TownSpec, processes: int | None = 1) -> None:
     ``transforms.json`` if asked for; ``town.json`` (the spec).
 
     Args:
-        processes: number of photographs rendered at once; None is one per core.
+        processes: The number of photographs rendered at once; None is one per core.
 
     Raises:
-        UserError: options out of their range, or ``folder`` holds something else.
+        UserError: Options are out of their range, or ``folder`` holds something else.
     """
     spec.check()
     with new_scene(folder, "town.json", "synthetic town") as work:

@@ -30,14 +30,14 @@ class Measured(BaseModel):
 
     Attributes:
         benchmark: The name of its module, without ``benchmarks.``.
-        command: the command that repeats the measurement.
-        note: the protocol, or other programs that were running.
+        command: The command that repeats the measurement.
+        note: The protocol, or other programs that were running.
         date: The date of the end, ISO 8601.
         commit: The commit of the checkout; None if it is unknown.
         cores: The number of logical cores.
         memory_mb: The memory, MiB.
         load_average: The load of the last minute; None if the system does not provide it.
-        instruction_set: the target of the rasterizer's library.
+        instruction_set: The target of the rasterizer's library.
         compiler: The compiler that compiled it, with its version.
     """
 

@@ -405,7 +405,7 @@ MUTANTS: dict[str, Mutant] = {
 
 @dataclass(frozen=True)
 class Result:
-    """``caught``: the first test that failed; empty where none did."""
+    """The outcome of one fault. ``caught`` is the first failed test, or empty if all passed."""
 
     name: str
     caught: str
@@ -413,7 +413,7 @@ class Result:
 
 
 def copy_project(target: Path) -> None:
-    """The sources, and beside them what is compiled of them already."""
+    """Copy the sources, and the libraries that are already compiled from them."""
     built = Path(os.environ.get("SPLATMAKE_CACHE", ROOT / "build" / "native"))
     if built.is_dir():
         shutil.copytree(built, target.parent / "native")
@@ -427,10 +427,10 @@ def copy_project(target: Path) -> None:
 
 
 def first_failure(project: Path, tests: Sequence[str]) -> str:
-    """The first test that fails, "" where all pass.
+    """The first test that fails; empty if all pass.
 
     Raises:
-        RuntimeError: the tests could not run at all.
+        RuntimeError: The tests could not run at all.
     """
     missing = [test for test in tests if not (project / test).exists()]
     if missing:
@@ -472,7 +472,7 @@ def try_mutant(name: str, project: Path) -> Result:
 
 
 def row(result: Result) -> str:
-    """As Markdown."""
+    """A row of the Markdown table."""
     mutant = MUTANTS[result.name]
     caught = f"`{result.caught}`" if result.caught else "**survived**"
     return f"| {mutant.what} | `{mutant.file}` | {caught} | {result.seconds:.0f} |"

@@ -152,8 +152,8 @@ FAMILIES: dict[str, Callable[[Case], None]] = {
 
 @dataclass
 class Tally:
-    """What a family came to. ``colour``: the largest error of pixels off the cut-offs, relative
-    to the image's largest value where that is above 1. ``gradients``: relative L2 errors of
+    """The results of a family. ``colour`` is the largest error of pixels off the cut-offs, relative
+    to the image's largest value if that is above 1. ``gradients`` are the relative L2 errors of
     calls, all five parameters together, of Gaussians whose float64 gradient float32 can hold."""
 
     cases: int = 0

@@ -54,8 +54,8 @@ def scene_record(
         training: The preset, or what else names the training in tables.
 
     Raises:
-        NotComparable: the runs are of several scenes, commits, machines or protocols.
-        OSError, KeyError: a folder is not a finished scene.
+        NotComparable: The runs are of several scenes, commits, machines or protocols.
+        OSError, KeyError: A folder is not a finished scene.
     """
     every = [_run(folder) for folder in folders]
     first = every[0]

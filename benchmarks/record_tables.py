@@ -239,7 +239,7 @@ def table_of(kind: str, records: Sequence[Stored]) -> str:
     """The table of a kind, of the results of all records.
 
     Raises:
-        UserError: a record has other fields.
+        UserError: A record has other fields.
     """
     of_result, made = TABLES[kind]
     found: list[Any] = []

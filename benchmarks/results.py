@@ -1,6 +1,6 @@
 """Results of the benchmarks, as printed and stored in records.
 
-The SfM benchmark's are in ``benchmarks.sfm.summary``.
+The results of the SfM benchmark are in ``benchmarks.sfm.summary``.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ class GeoreferenceResult:
 
 @dataclass(frozen=True)
 class MemoryResult:
-    """Attributes:
-    gaussians, most_gaussians: their number at the end, and the largest during training.
-    width, height: of each view, pixels.
-    checkpoints_mb: size of the checkpoints, MB.
-    planned_mb, peak_mb: the plan's estimate and the measured peak, MB.
+    """The memory of a training.
+
+    Attributes:
+        gaussians, most_gaussians: The number at the end, and the largest during training.
+        width, height: The size of each view, pixels.
+        checkpoints_mb: The size of the checkpoints, MB.
+        planned_mb, peak_mb: The plan's estimate and the measured peak, MB.
     """
 
     gaussians: int
@@ -61,11 +63,13 @@ class MemoryResult:
 
 @dataclass(frozen=True)
 class GrowthResult:
-    """Attributes:
-    cpu_s, peak_mb: of mapping alone; the memory in MiB.
-    power: exponent of the time's growth since the last number of views; None for the first.
-    registered: images with a pose.
-    rotation_deg, centre_m: median errors.
+    """The cost and the errors of mapping a number of photographs.
+
+    Attributes:
+        cpu_s, peak_mb: The CPU seconds and the peak memory (MiB) of mapping alone.
+        power: The exponent of the time's growth since the last number of views; None for the first.
+        registered: The number of images with a pose.
+        rotation_deg, centre_m: The median errors.
     """
 
     mapper: str
@@ -110,11 +114,11 @@ class StabilityResult:
     """Outcome of a case.
 
     Attributes:
-        what: the case in words.
+        what: The case in words.
         code: Snakemake's exit code.
         psnr, ssim: The means over the test views; None if the run failed.
-        reference: the case whose quality it should have, if any.
-        difference_db: PSNR minus that of the reference; None where either is unknown.
+        reference: The case whose quality it should have, if any.
+        difference_db: The PSNR minus that of the reference; None if either is unknown.
         gaussians: The final number of Gaussians.
         message: The message of the error, or the warnings of the result.
         traceback: Whether a traceback was printed.
@@ -171,8 +175,8 @@ class GpuResult:
         step_ms, cpu_step_ms: The wall time of a step.
         frames_per_s, cpu_frames_per_s: The rate of rendering alone, with the copy of the image.
         bandwidth: The bytes per second that copies inside the device's memory read and write.
-        moments_bandwidth: bytes of SH coefficients and moments over the time of the kernel that
-            updates them.
+        moments_bandwidth: The bytes of SH coefficients and moments over the time of the kernel
+            that updates them.
     """
 
     device: str
@@ -207,8 +211,8 @@ class BlocksResult:
         peak_rss_mb: The largest memory of any job, MiB.
         training_cpu_s: The CPU seconds of all training jobs.
         largest_block_cpu_s: The CPU seconds of the block that takes longest.
-        seam_gradient: mean gradient of the error images of the test views across the seams of the
-            blocks, divided by that elsewhere. The first run has no seams: its value is that of
+        seam_gradient: The mean gradient of the error images of the test views across the seams of
+            the blocks, divided by that elsewhere. The first run has no seams: its value is that of
             what the photographs show there.
     """
 
@@ -334,10 +338,10 @@ class PoseResult:
     """A pose file, right or with one mistake.
 
     Attributes:
-        program: the format; empty for the scene's own file.
+        program: The format; empty for the scene's own file.
         mistake: The name of the mistake; empty for right poses.
         text: What was said.
-        seconds: the time of plan and comparison; features and matches are computed once a scene.
+        seconds: The time of plan and comparison; features and matches are computed once a scene.
     """
 
     scene: str

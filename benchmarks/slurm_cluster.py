@@ -67,7 +67,7 @@ class Cluster:
     Attributes:
         folder: The folder of its configuration, state and logs.
         environment: The variables with which Slurm's commands find it.
-        controllers: the running one's supervisor.
+        controllers: The supervisor of the running controller.
     """
 
     folder: Path
@@ -139,7 +139,7 @@ class Cluster:
 
 
 def missing_programs() -> list[str]:
-    """What is missing to start a cluster: programs, or being root."""
+    """What is missing to start a cluster, such as programs or the rights of root."""
     missing = [name for name in PROGRAMS if shutil.which(name, path=_path()) is None]
     if CONF.exists() and not CONF.read_text().startswith(MARK):
         missing.append(f"a machine without {CONF}")

@@ -96,7 +96,7 @@ class Scene:
 
     @property
     def test_views(self) -> list[View]:
-        """The test views, which are not used for training; may be empty."""
+        """The test views, which are not used for training. There may be none."""
         return [view for view in self.views if view.is_test]
 
     def view(self, name: str) -> View:
@@ -132,7 +132,7 @@ class Scene:
                 views.
 
         Raises:
-            UserError: a photograph that cannot be read, or masks that leave no pixel.
+            UserError: A photograph cannot be read, or its mask leaves no pixel.
         """
         protocol = replace(
             self._protocol, views=list(views) or self._protocol.views, training_views=[]
@@ -173,7 +173,7 @@ def load(
         threads: The number of threads for rendering; None: one per core.
 
     Raises:
-        UserError: a scene or a file that is missing, unfinished or cannot be read.
+        UserError: A scene or a file is missing, unfinished or unreadable.
     """
     folder = Path(folder)
     file = folder / "train" / "gaussians.npz" if model is None else Path(model)
@@ -195,7 +195,7 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
     """Read Gaussians from a .ply, .spz, .splat, .glb or .npz file.
 
     Raises:
-        UserError: An unknown suffix, or a file that cannot be read.
+        UserError: The suffix is unknown, or the file cannot be read.
     """
     found: list[str] = []
     gaussians = splat_files.read_gaussians(Path(file), found)
@@ -208,7 +208,7 @@ def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
     hold.
 
     Raises:
-        UserError: An unknown suffix, or Gaussians that the format cannot hold.
+        UserError: The suffix is unknown, or the format cannot hold the Gaussians.
     """
     _warn(splat_files.write_gaussians(Path(file), gaussians))
 

@@ -55,7 +55,7 @@ def run(setup: Setup, points: Points, asked: argparse.Namespace) -> None:
     """Measure the points that the record lacks.
 
     Raises:
-        UserError: a run fails, or the record holds points of other options.
+        UserError: A run fails, or the record holds points of other options.
     """
     for scene in asked.scenes:
         for seed in asked.seeds:
@@ -66,7 +66,7 @@ def run(setup: Setup, points: Points, asked: argparse.Namespace) -> None:
 
 
 def warn_of_load(cores: int) -> None:
-    """Say so if other programs run."""
+    """Print a warning if other programs use the cores."""
     load = machine_facts()["load_average"]
     if load is not None and load > HIGH_LOAD * cores:
         print(
@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def repeated(points: Sequence[BudgetResult], asked: argparse.Namespace) -> list[str]:
-    """Arguments of the command that repeats all points of the record."""
+    """The arguments of the command that repeats all points of the record."""
     wanted = {"scenes": asked.scenes, "minutes": asked.minutes, "seeds": asked.seeds}
     config = ["--config", *asked.config] if asked.config else []
     return [*joint_arguments(points, wanted), "--data", "DATA", *config]

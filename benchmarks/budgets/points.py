@@ -34,7 +34,7 @@ class Setup:
     Attributes:
         data: The folder of the scene folders.
         work: The folder for ``results/``.
-        options: the configuration besides the time budget.
+        options: The configuration besides the time budget.
         cores: The number of cores.
     """
 
@@ -59,7 +59,7 @@ def train(setup: Setup, scene: str, seed: int, minutes: float) -> BudgetResult:
     """Train a scene for a time and measure it.
 
     Raises:
-        UserError: the run failed.
+        UserError: The run failed.
     """
     run = setup.run(scene, seed, minutes)
     training = {**setup.options.get("train", {}), "budget_minutes": minutes}
@@ -121,7 +121,7 @@ class Points:
     """The finished points, in a record that is written after each one.
 
     Attributes:
-        path: the record.
+        path: The file of the record.
         facts: The facts of this machine and checkout; the command is that of all points.
     """
 
@@ -129,7 +129,7 @@ class Points:
         """Read the points of an earlier call.
 
         Raises:
-            UserError: the record cannot be read, or is of another machine or checkout.
+            UserError: The record cannot be read, or is of another machine or checkout.
         """
         self.path, self.facts = path, facts
         self.points: list[BudgetResult] = []
@@ -179,7 +179,7 @@ class Points:
 
 
 def joint_arguments(points: Sequence[BudgetResult], asked: dict[str, list[Any]]) -> list[str]:
-    """Arguments of the command that repeats the points of a record and those asked for."""
+    """The arguments of the command that repeats the points of a record and those asked for."""
     scenes = dict.fromkeys([*(p.scene for p in points), *asked["scenes"]])
     minutes = sorted({*(p.minutes for p in points), *asked["minutes"]})
     seeds = sorted({*(p.seed for p in points), *asked["seeds"]})

@@ -64,7 +64,7 @@ def _row(points: Sequence[BudgetResult]) -> list[str]:
 
 
 def _or_dashes(rows: list[list[str]]) -> list[list[str]]:
-    """A heading without rows gets one of dashes: nothing is measured yet."""
+    """The rows, with a row of dashes below a heading for which nothing is measured yet."""
     return rows if len(rows) > 1 else [*rows, ["-"] * len(rows[0])]
 
 

@@ -43,7 +43,7 @@ class Found:
     """What the program makes of a case.
 
     Attributes:
-        frame: None if there is none.
+        frame: The world frame; None if there is none.
         said: The messages to the user.
     """
 
@@ -66,7 +66,7 @@ def by_gps(survey: Survey, tags: Sequence[Tags]) -> Found:
 
 
 def few(count: int) -> Case:
-    """GPS in ``count`` photographs only, spread over the flight."""
+    """A case with GPS in ``count`` photographs only, spread over the flight."""
 
     def case(rng: np.random.Generator) -> Found:
         survey = drone_survey(rng)
@@ -187,9 +187,9 @@ def by_control(
     """Ground control points.
 
     Args:
-        count: Their number.
+        count: The number of points.
         header, code, change: See ``survey.write_control``.
-        places: Moves the points, for example onto a line.
+        places: The function that moves the points, for example onto a line.
         gps: Whether the photographs have GPS positions as well.
     """
 

@@ -160,7 +160,7 @@ def main() -> int:
 
 
 def _finite(value: Any) -> float | None:
-    """A number of the evidence as Python's; None where it is missing or not finite."""
+    """A number of the evidence as a Python float; None where it is missing or not finite."""
     if value is None or not np.isfinite(value):
         return None
     return float(value)

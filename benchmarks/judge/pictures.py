@@ -33,7 +33,7 @@ BLUR = 5.0
 
 @dataclass(frozen=True)
 class Matched:
-    """Database of a scene with the options of mapping from its plan."""
+    """The database of a scene with the options of mapping from its plan."""
 
     database: Path
     total: int
@@ -119,7 +119,7 @@ def _match(
 ) -> None:
     from pipeline.sfm.matching import MatchingScene, match_features
 
-    # No verified pair, which this stage reports. Mapping then finds no model.
+    # This stage raises an error if no pair is verified. Mapping then finds no model.
     with contextlib.suppress(UserError):
         scene = MatchingScene(manifest, features, sfm, seed)
         match_features(scene, matches, work / "database.db")

@@ -30,13 +30,16 @@ HYPOTHESES = 600
 
 @dataclass(frozen=True)
 class Truth:
-    """Attributes:
-    grade: by ``share``; failed too where there is no model or one of too few photographs, and
-        where the true cameras never moved.
-    share: of the views that have a pose and a true one, how many are right.
-    common: their number.
-    rotation_deg, centre: medians over all of these, after the robust similarity; the centre over
-        the true radius. None where no similarity was found.
+    """The grade of a model and its errors.
+
+    Attributes:
+        grade: The grade by ``share``. It is "failed" too if there is no model or one of too few
+            photographs, or if the true cameras never moved.
+        share: The share of correct views among those that have a pose and a true one.
+        common: The number of views that have a pose and a true one.
+        rotation_deg, centre: The median errors over those of these views that show the model's
+            scene, after the robust similarity; the centre relative to the true radius. None if no
+            similarity was found.
     """
 
     grade: Grade
@@ -55,8 +58,8 @@ def grade(
     """Grade a model.
 
     Args:
-        truths: of the scenes that were photographed; the model is of the one it has most views of,
-            and its views of the others are wrong.
+        truths: The true cameras of each photographed scene. The model is taken to be of the scene
+            that most of its views show; its views of the others are wrong.
         total: The number of photographs.
         depth: The typical distance of what the cameras saw, in the truth's unit; None if unknown.
     """

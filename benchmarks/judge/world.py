@@ -68,7 +68,7 @@ class Shot:
     Attributes:
         rotation, centre: The true pose, world to camera.
         scene: The index of the visible scene.
-        mirrored: the photograph is flipped horizontally.
+        mirrored: Whether the photograph is flipped horizontally.
         prior: The focal length in EXIF over the true one; None without EXIF.
         blur: The additional noise of the keypoints, pixels.
         copy_of: The index of the photograph that this is a copy of.
@@ -141,7 +141,7 @@ class Written:
     """Photographs and ground truth of a synthetic capture.
 
     Attributes:
-        truths: cameras of each scene, and of each mirrored scene: a model can contain only
+        truths: The cameras of each scene and of each mirrored scene. A model can contain only
             one of them.
         depth: The median distance of the visible points.
     """
@@ -171,7 +171,7 @@ def write(made: Made, path: Path, seed: int) -> Written:
         for i in range(len(seen)):
             for j in range(i + 1, len(seen)):
                 matches = _match(made, i, j, seen, rng)
-                # Fewer cannot be verified, and trying takes longest.
+                # A pair with fewer matches cannot be verified, and trying takes longest.
                 if len(matches) >= MIN_INLIERS:
                     database.write_matches(i + 1, j + 1, matches.astype(np.uint32))
     options = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)

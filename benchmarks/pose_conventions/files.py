@@ -51,7 +51,7 @@ class Program:
     """A program's pose file.
 
     Attributes:
-        name: the program, as in tables.
+        name: The name of the program in tables.
         write: The function that writes its pose file into a scene folder, with one mistake.
         named: What the message says about each mistake, as regular expressions.
     """

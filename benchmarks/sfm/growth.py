@@ -117,7 +117,7 @@ def name_of(index: int) -> str:
 
 
 def mapping(folder: Path, count: int, mapper: str) -> None:
-    """As in stages/sfm.py."""
+    """Do what stages/sfm.py does."""
     from pipeline.sfm.mapping import reconstruct
 
     photos = [

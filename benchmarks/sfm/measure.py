@@ -74,7 +74,7 @@ def _used() -> float:
 
 
 def our_features(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """As in stages/features.py."""
+    """Do what stages/features.py does."""
     from pipeline.sfm.features import extract_features
 
     extract_features(
@@ -83,7 +83,7 @@ def our_features(manifest: Manifest, config: Config, folder: Path, threads: int)
 
 
 def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """As in stages/matches.py."""
+    """Do what stages/matches.py does."""
     from pipeline.sfm.matching import MatchingScene, match_features
 
     scene = MatchingScene(manifest, folder / "features", config.sfm, config.seed)
@@ -93,7 +93,7 @@ def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) 
 
 
 def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """As in stages/sfm.py."""
+    """Do what stages/sfm.py does."""
     from pipeline.sfm.mapping import reconstruct
 
     database = folder / "matches" / "database.db"
@@ -101,7 +101,8 @@ def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) 
 
 
 def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:
-    """pycolmap's defaults, except for the threads, and a single camera if our scan finds one."""
+    """Extract features with pycolmap's defaults, except for the threads, and with a single camera
+    if our scan finds one."""
     import pycolmap
 
     photo = manifest.photos[0]
@@ -117,7 +118,7 @@ def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:
 
 
 def reference_matches(manifest: Manifest, folder: Path, threads: int) -> None:
-    """Exhaustive matching with verification."""
+    """Match all pairs and verify them."""
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
@@ -127,7 +128,7 @@ def reference_matches(manifest: Manifest, folder: Path, threads: int) -> None:
 
 
 def reference_mapping(manifest: Manifest, folder: Path, threads: int) -> None:
-    """Incremental mapping; writes the model with the most images."""
+    """Map incrementally, and write the model with the most images."""
     import pycolmap
 
     photo = manifest.photos[0]

@@ -47,7 +47,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Configuration:
-    """``name`` is preset/mapper/pairs. ``planned``: it is the choice of the plan for the scene."""
+    """``name`` is preset/mapper/pairs. ``planned`` is True for the plan's choice for the scene."""
 
     name: str
     config: Config
@@ -58,7 +58,7 @@ def load_scene(folder: Path, every: int = 1) -> Scene:
     """The scene in ``folder``, with every ``every``-th photograph, sorted by name.
 
     Raises:
-        UserError: the folder brings no poses to measure against.
+        UserError: The folder has no poses to measure against.
     """
     name = folder.resolve().name
     found = scan(folder, name, Config(poses="ignore"), cache=None)

@@ -28,12 +28,14 @@ class Cost:
 
 @dataclass(frozen=True)
 class Run:
-    """Attributes:
-    planned: the configuration is the choice of the plan.
-    costs: of each step.
-    registered: photographs with a pose.
-    error: against the scene's poses; None where there is no model.
-    failure: why not.
+    """One run of a configuration.
+
+    Attributes:
+        planned: Whether the configuration is the choice of the plan.
+        costs: The cost of each step.
+        registered: The number of photographs with a pose.
+        error: The errors against the scene's poses; None if there is no model.
+        failure: The reason why there is no model.
     """
 
     scene: str
@@ -55,8 +57,8 @@ class Summary:
 
     Attributes:
         cpu_s: The CPU seconds of each step; ``total_s`` is their sum.
-        rotation_deg, centre, centre_permille, auc1: median errors over the images in degrees,
-            the world's unit and thousandths of the cameras' radius; area under the curve of
+        rotation_deg, centre, centre_permille, auc1: The median errors over the images in degrees,
+            the world's unit and thousandths of the cameras' radius; the area under the curve of
             relative pose errors up to one degree. None without any model.
         runs, failed: The number of runs, and of those without a model.
     """

@@ -41,12 +41,12 @@ class Case:
     """One scene.
 
     Attributes:
-        make: writes the scene into a folder that is there and empty; its second argument is the
-            room as everybody photographs it, with poses and points.
+        make: The function that writes the scene into an existing, empty folder. Its second
+            argument is the folder of the base scene, with poses and points.
         what: The description for the table.
-        expected: "same": quality is the reference's within ``__main__.TOLERANCE_DB``; "works":
+        expected: "same": the quality is the reference's within ``__main__.TOLERANCE_DB``; "works":
             a result, with a PSNR of at least ``least``; "error": one clear message.
-        reference: the case whose quality it should have.
+        reference: The case whose quality it should have.
         config: The options beside the tiny run's.
     """
 
@@ -171,7 +171,8 @@ def taken(
         given: Whether poses and the room's points come along.
         focal: The focal length, in units of the room's own.
         told_focal: The focal length that the given cameras say instead, pixels.
-        alone: the objects before black instead of the room, which ends 3.5 from its middle.
+        alone: Whether the objects are before black instead of in the room, which ends 3.5 from its
+            middle.
     """
 
     def make(folder: Path, room: Path) -> None:

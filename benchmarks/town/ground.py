@@ -20,7 +20,7 @@ from benchmarks.town.solids import Ellipsoid, Solid
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-# Towards the sun.
+# The direction towards the sun.
 SUN = np.array([-0.48, -0.55, 0.683]) / np.linalg.norm([-0.48, -0.55, 0.683])
 SUNLIGHT = np.array([0.86, 0.79, 0.69], np.float32)
 SKYLIGHT = np.array([0.36, 0.40, 0.46], np.float32)
@@ -38,7 +38,7 @@ class Ground:
     Attributes:
         map: The shares of sun, sky, paving and town at each place, of 255.
         corner: (2,) its lower left corner; ``texel`` its resolution, metres.
-        noise: the periodic tile.
+        noise: The periodic tile.
     """
 
     map: Pyramid

@@ -87,7 +87,7 @@ def _tilted(degrees: float) -> Array:
 
 
 def _descent() -> list[tuple[Array, Array]]:
-    """Down along an arc around a point of the street, looking at it along the street."""
+    """The descent along an arc around a point of the street, looking at it along the street."""
     shots = []
     for i, degrees in enumerate(ELEVATIONS):
         share = i / (len(ELEVATIONS) - 1)
@@ -101,8 +101,8 @@ def _descent() -> list[tuple[Array, Array]]:
 
 
 def _walk() -> list[tuple[Array, Array]]:
-    """There on the pavement at +y and back on the other, looking ahead, to the far side, and at
-    last back."""
+    """The walk along the pavement at +y and back on the other one, looking ahead, to the far side,
+    and at last back."""
     shots = []
     along = np.linspace(EDGE, LENGTH - EDGE, STEPS)
     swing = np.linspace(*SWING, STEPS)

@@ -23,7 +23,8 @@ class Pyramid:
         packed: (H, W, K) uint8.
         left, top: (L,) corner of each level in ``packed``.
         width, height: (L,) size of each level.
-        periodic: the image repeats; each level has its first column and row again at its end.
+        periodic: Whether the image repeats. If so, each level ends with a copy of its first
+            column and row.
     """
 
     packed: NDArray[np.uint8]

@@ -102,7 +102,7 @@ def prism(
     Args:
         profile: The corners in the plane of the frame's first two axes, in either order.
         length: The extent along the third axis, from the frame's origin.
-        finish: the finish of a face by its outward normal.
+        finish: The finish of a face by its outward normal.
     """
     corners = np.array(profile, np.float64)
     following = np.roll(corners, -1, axis=0)

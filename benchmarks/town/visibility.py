@@ -132,7 +132,7 @@ def _candidates(
     """Solids in front of the camera whose projections meet the image, nearest first; and of all
     solids the bounds of the projection (S, 2) and the largest inverse depth (S,)."""
     offset = shapes.corners - posed.centre
-    # Written out: BLAS may round differently with other threads.
+    # Avoid a matrix product: BLAS may round differently with the number of threads.
     local = [(offset * row).sum(-1) for row in posed.rotation]
     x, y, z = local
     front = np.maximum(z, NEAR)
@@ -184,8 +184,9 @@ class _Planes:
     """A prism seen from a camera: inverse depths of its faces as weights of (x, y, 1).
 
     Attributes:
-        outside: (F, 3) of the faces that the camera is outside of, ``faces`` their indices.
-        inside: (G, 3) of the others.
+        outside: (F, 3) weights of the faces that the camera is outside of; ``faces`` has their
+            indices.
+        inside: (G, 3) weights of the other faces.
     """
 
     outside: Array

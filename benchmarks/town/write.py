@@ -41,8 +41,8 @@ Order = Literal["sequence", "scattered"]
 MAX_PHOTOGRAPHS = 20_000
 MIN_SIDE, MAX_SIDE = 16, 4096  # pixels
 START = datetime(2026, 1, 1, 8)
-# Between photographs: seconds along the path; minutes where they are in no order, so that nothing
-# takes them for a sequence.
+# The time between photographs. Scattered ones are minutes apart, so that nothing takes them for a
+# sequence.
 INTERVALS = {"sequence": timedelta(seconds=2), "scattered": timedelta(minutes=1)}
 LENS_CHOICES = tuple(name for name in LENSES if name not in WIDE and "fisheye" not in name)
 
@@ -52,7 +52,7 @@ class TownSpec:
     """Options of the town.
 
     Attributes:
-        photographs: the town's area is proportional to their number.
+        photographs: The number of photographs, to which the town's area is proportional.
         width, height: The size in pixels.
         distortion: One of ``LENS_CHOICES``.
         order: The order of names and times: along the camera path, or "scattered" at random.
@@ -69,7 +69,7 @@ class TownSpec:
     seed: int = 0
 
     def check(self) -> None:
-        """Raises UserError if an option is out of its range."""
+        """Raise UserError if an option is out of its range."""
         if not 1 <= self.photographs <= MAX_PHOTOGRAPHS:
             raise UserError(
                 f"a town of {self.photographs} photographs", fix=f"1 to {MAX_PHOTOGRAPHS}."
@@ -138,7 +138,7 @@ def _camera(spec: TownSpec) -> Camera:
 
 @lru_cache(maxsize=1)
 def _views(spec: TownSpec) -> list[PosedImage]:
-    """Along the path, with their names."""
+    """The cameras along the path, with their names."""
     return camera_path([f"town_{number:05d}.jpg" for number in _numbers(spec)], spec.seed)
 
 

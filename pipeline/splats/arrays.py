@@ -61,11 +61,11 @@ class GaussianArrays:
         return math.isqrt(self.sh.shape[1]) - 1
 
     def arrays(self) -> dict[str, Array]:
-        """The arrays by name; not copies."""
+        """The arrays by name. They are not copied."""
         return {name: getattr(self, name) for name in NAMES}
 
     def chunks(self, *names: str) -> Iterator[list[Array]]:
-        """See ``GaussianSource``; not copies."""
+        """See ``GaussianSource``. The arrays are not copied."""
         for start in range(0, len(self), CHUNK):
             yield [getattr(self, name)[start : start + CHUNK] for name in names]
 

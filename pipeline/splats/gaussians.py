@@ -50,8 +50,8 @@ class Gaussians:
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name, in the order of the fields; not copies. Without those that are
-        None."""
+        """The tensors that are not None by name, in the order of the fields. They are not
+        copied."""
         found = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: tensor for name, tensor in found.items() if tensor is not None}
 
@@ -95,7 +95,7 @@ class Gaussians:
         return Gaussians(**{k: v[which].contiguous() for k, v in self.tensors().items()})
 
     def clone(self) -> Gaussians:
-        """A copy of all tensors."""
+        """The same Gaussians with copies of all tensors."""
         return Gaussians(**{k: v.clone() for k, v in self.tensors().items()})
 
     def with_sh_degree(self, degree: int) -> Gaussians:

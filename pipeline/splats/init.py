@@ -36,7 +36,7 @@ SIGN_DIRECTION = np.array([1.0, 0.7548, 0.5698])
 # (at a focal length of 1000) to half a view. A lower maximum leaves holes between sparse points; a
 # higher one lets outliers cover the scene.
 MIN_ANGLE, MAX_ANGLE = 1e-4, 0.5
-# The same for a Gaussian without neighbours.
+# Standard deviation of a Gaussian without neighbours, as seen from the nearest camera, radians.
 LONE_ANGLE = 0.1
 # Range of the distance to the nearest camera, relative to the median: points outside are SfM
 # errors, such as points at a camera's centre.

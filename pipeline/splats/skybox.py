@@ -25,15 +25,15 @@ from pipeline.splats.init import (
 
 # Number of Gaussians: one every 9 degrees, which density control splits where sky has detail.
 NUM_GAUSSIANS = 500
-# Radius: this many times the depth of all but so many of the points.
+# The radius is RADIUS times this quantile of the depths of the points.
 RADIUS, DEPTH_QUANTILE = 10.0, 0.95
-# Cameras and points can be in one place.
+# Lower bound of the depth: cameras and points can be in one place.
 MIN_DEPTH = 1e-12
 # The sky is this many times as far from the cameras as half of the scene.
 SKY_DISTANCE = 5.0
 # Standard deviation, in distances of neighbours. Smaller ones leave gaps.
 SPREAD = 0.7
-# They must hide the background before training has seen them.
+# The skybox must hide the background from the first step on.
 OPACITY = 0.95
 # The colour of a Gaussian is a mean over this many points, the nearest in direction.
 NUM_POINTS = 16

@@ -1,4 +1,4 @@
-"""The settings of a training: everything that it is given besides the inputs."""
+"""The settings of a training: all of its arguments besides the inputs."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class TrainingRun:
         threads: The number of threads that the native operators use. torch itself runs on one, so
             that sums do not change.
         memory_mb: The memory limit of training: images that do not fit beside the Gaussians are
-            read from a temporary file. None: three quarters of the memory of the machine or
-            container, which is the limit in any case.
+            read from a temporary file. It is never above three quarters of the memory of the
+            machine or container, which is the limit for None.
         part: The part of the schedule that is trained.
     """
 

@@ -58,7 +58,7 @@ def choose_appearance(
         points: (N, 3) of the scene, for a model without points.
         wanted: The option ``train.appearance``.
         cameras: The camera group of each photograph.
-        has_alpha: Whether photographs have alpha: exposure is not modelled.
+        has_alpha: Whether photographs have alpha. If so, exposure is not modelled.
         in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
     choice = AppearanceChoice(embeddings=wanted == "embedding")

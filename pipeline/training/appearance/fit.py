@@ -68,10 +68,10 @@ def fit_embedding(
 
     Args:
         gaussians: The Gaussians with ``appearance``.
-        photo: (H, W, 3), over the background of ``options``.
-        pixels: (H, W), those to fit.
+        photo: (H, W, 3) colours over the background of ``options``.
+        pixels: (H, W) bool, True for the pixels to fit.
         known: (V, K) embeddings of the training photographs, of mean 0.
-        backend: None: the default.
+        backend: The backend of the rasterizer; None: the default.
     """
     backend = backend or make_backend()
     options = limit_sh_degree(options, gaussians)

@@ -70,7 +70,7 @@ class BlockLayers:
         rendered = self.backend.forward_subsets(
             self.coarse.parameters(), raster_camera(view), self.options, layers
         )
-        # Render one after the other, and keep only the image of each.
+        # Only the image of each render is kept.
         images = ((found.color, found.alpha) for found in rendered)
         front, transmittance = _front(*next(images))
         block, block_alpha = next(images)
@@ -90,7 +90,7 @@ class BlockLayers:
         )
 
     def _hidden(self, which: Tensor, view: View) -> Tensor:
-        """(N,) bool, those of some of the Gaussians, outside of the region, that are behind it."""
+        """(N,) bool: the Gaussians of ``which``, outside of the region, that are behind it."""
         rows = which.nonzero()[:, 0]
         means = self.coarse.means[rows].numpy()
         hidden = torch.zeros_like(which)

@@ -53,7 +53,7 @@ MIN_THROUGH_SHARE, RAY_STEP = 0.02, 4
 
 @dataclass(frozen=True)
 class PartitionOptions:
-    """What a partition depends on besides the coarse Gaussians and the views.
+    """The settings that determine a partition, besides the coarse Gaussians and the views.
 
     Attributes:
         blocks: The number of blocks.

@@ -1,4 +1,4 @@
-"""What a partition and the training of blocks are described by."""
+"""Descriptions of a partition and of the training of blocks."""
 
 from __future__ import annotations
 

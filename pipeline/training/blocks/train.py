@@ -1,4 +1,4 @@
-"""What the training of one block works on."""
+"""The inputs of the training of one block."""
 
 from __future__ import annotations
 

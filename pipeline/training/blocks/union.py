@@ -25,7 +25,7 @@ class Union:
         files: The files of the blocks' Gaussians, by number.
 
     Raises:
-        UserError: a file is missing, damaged, or not one of Gaussians.
+        UserError: A file is missing, damaged, or not one of Gaussians.
     """
 
     def __init__(self, files: Sequence[Path], partition: Partition) -> None:

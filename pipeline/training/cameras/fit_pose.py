@@ -33,8 +33,8 @@ def fit_pose(
     """The view with the pose at which the render of the fixed scene is closest to its photograph.
 
     Args:
-        photo: (H, W, 3), over the background of ``options``.
-        mask: (H, W), False for ignored pixels.
+        photo: (H, W, 3) colours over the background of ``options``.
+        mask: (H, W) bool, False for ignored pixels.
         gain: The factor of each channel of the render.
         extent: The unit of translations (``scene.views.scene_extent``), world units.
         ssim_weight: The weight of SSIM in the loss, as in training.

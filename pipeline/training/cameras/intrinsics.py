@@ -30,8 +30,8 @@ class IntrinsicsRefinement:
         camera_of: (V,) index of each view's camera in ``ids``.
         limit: The upper limit of the total change, in focal lengths.
         change: (C, 3) logarithm of the factor of both focal lengths, and the shift of the principal
-            point in x and y, in units of the given focal length in x: independent of the size of
-            the image.
+            point in x and y, in units of the given focal length in x, which do not depend on the
+            size of the image.
         adam: (C, 3) moments of the change.
     """
 

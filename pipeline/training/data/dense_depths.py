@@ -22,10 +22,10 @@ def add_dense_depths(
     """``points`` with samples of the views' dense depth maps, whose weights are their confidences.
 
     Args:
-        folder: The outputs of the stage dense.
+        folder: The folder with the outputs of the stage dense.
 
     Raises:
-        UserError: a depth map is missing or damaged.
+        UserError: A depth map is missing or damaged.
     """
     return [merged(own, _samples(view, folder)) for view, own in zip(views, points, strict=True)]
 

@@ -83,10 +83,10 @@ def map_depths(
         digest: The file's recorded digest.
 
     Returns:
-        the samples, each of weight 1, and the fit; None if the map does not fit the points.
+        The samples, each of weight 1, and the fit; None if the map does not fit the points.
 
     Raises:
-        UserError: the file is not a readable depth map, or has another aspect ratio.
+        UserError: The file is not a readable depth map, or has another aspect ratio.
     """
     full = load_depth(path, view.width / view.height, digest)
     height, width = full.shape
@@ -136,8 +136,8 @@ def add_maps(
         fitted_to: The depths that maps are fitted to: ``points``, or others if there are none.
 
     Returns:
-        known depths by view; the number of maps by kind of fit; names of views whose maps do not
-        fit.
+        The known depths by view; the number of maps by kind of fit; the names of views whose maps
+        do not fit.
     """
     known, kinds, refused = list(points), dict.fromkeys(("factor", "depth", "inverse"), 0), []
     for index, (view, file) in enumerate(zip(views, maps, strict=True)):

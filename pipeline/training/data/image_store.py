@@ -31,19 +31,19 @@ class ImageStore(Protocol):
 
 
 class MemoryStore:
-    """In memory."""
+    """Holds images in memory."""
 
     def add(self, planes: Planes) -> Callable[[], Planes]:
         return lambda: planes
 
 
 class DiskStore:
-    """In an anonymous temporary file, which disappears with the process.
+    """Holds images in an anonymous temporary file, which disappears with the process.
 
     The system's page cache holds as much of it as fits into free memory.
 
     Raises:
-        OSError: the disk is full or not writable.
+        OSError: The disk is full or not writable.
     """
 
     def __init__(self) -> None:

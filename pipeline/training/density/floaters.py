@@ -27,7 +27,7 @@ EMPTY_SHARE, NEAREST, MIN_POINTS = 0.5, 0.02, 20
 #: empty space of the views that have most of it: one in so many views, at least one.
 WEIGHT_SHARE, MIN_WEIGHT = 0.5, 0.1
 VIEWS_PER_FLOATER_VIEW = 100
-FADED_LOGIT = -20.0  # of the opacity
+FADED_LOGIT = -20.0  # The opacity logit of a faded floater.
 #: Floaters are removed after these shares of a run, so that others can take their place.
 RUN_SHARES = 0.3, 0.5, 0.7, 0.9
 #: Runs of fewer epochs have hardly any floaters, and one removal costs as much as two epochs.
@@ -69,7 +69,7 @@ class FloaterRemoval:
         """Make floaters transparent, in place, so that density control prunes them.
 
         Returns:
-            the number of floaters.
+            The number of floaters.
         """
         found = floaters(gaussians, views, self.depths)
         gaussians.opacity_logits[found] = FADED_LOGIT

@@ -70,13 +70,13 @@ class GradientDensity(Strategy):
         return self.observed.gradient_sum, self.observed.seen
 
     def resets_opacity_after(self, step: int) -> bool:
-        """Only if a whole interval of densification follows, in which opacities recover."""
+        """Return True if a whole interval of densification follows, in which opacities recover."""
         interval = self.reset_interval
         return step % interval == 0 and step + interval <= self.timeline.stop
 
     def prunes_large_after(self, step: int) -> bool:
-        """After the first opacity reset (3DGS): until then, large Gaussians (a distant background)
-        may not have been split yet. Never in runs too short for a reset."""
+        """Return True after the first opacity reset (3DGS): until then, large Gaussians (a distant
+        background) may not have been split yet. Runs too short for a reset never prune them."""
         resets = 2 * self.reset_interval <= self.timeline.stop
         return resets and self.reset_interval < step and self.timeline.densifies_after(step)
 

@@ -1,4 +1,4 @@
-"""How Gaussians multiply: what the strategies ``gradient`` and ``original`` share."""
+"""Cloning and splitting of Gaussians: what the strategies ``gradient`` and ``original`` share."""
 
 from __future__ import annotations
 

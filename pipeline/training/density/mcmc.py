@@ -43,7 +43,7 @@ class McmcDensity(Strategy):
     """Relocation, growth and noise.
 
     Attributes:
-        options: Growth, pruning threshold, weights of the regularisers.
+        options: The growth, the pruning threshold and the weights of the regularisers.
         steps: The length of the schedule.
         scale: The size of the scene (``training.data.known_depths.scene_scale``). The paper's scale
             loss and noise are in world units; here they are in this unit, so that results do not
@@ -62,7 +62,7 @@ class McmcDensity(Strategy):
         return self._has_noise(steps) or super().is_due(steps)
 
     def start(self, count: int) -> None:
-        """Nothing is observed."""
+        """Do nothing: this strategy observes no statistics."""
 
     def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
         """Add the gradients of the mean opacity and the mean scale (equation 10)."""
@@ -83,7 +83,7 @@ class McmcDensity(Strategy):
         return self.options.noise and steps.stop - 1 <= self.timeline.stop
 
     def _add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
-        """Noise of the Gaussian's covariance, for transparent Gaussians (equation 8), in place."""
+        """Move transparent Gaussians by noise of their covariance (equation 8), in place."""
         opacity = torch.sigmoid(gaussians.opacity_logits)
         moved = torch.nonzero(opacity < NOISE_OPACITY)[:, 0]
         if not len(moved):

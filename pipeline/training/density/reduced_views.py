@@ -14,7 +14,7 @@ class ReducedViews:
 
     Attributes:
         cameras: The cameras at the reduced size.
-        options: Those of training, but of SH degree 0 and without a background.
+        options: The options of training, but with SH degree 0 and without a background.
         pixel: The number of pixels of a view in one pixel of the reduced size.
     """
 

@@ -136,7 +136,7 @@ class Strategy:
         anew.
 
         Returns:
-            at most ``step.budget`` Gaussians, or at most as many as before, and what was changed.
+            At most ``step.budget`` Gaussians, or at most as many as before, and what was changed.
         """
         raise NotImplementedError
 

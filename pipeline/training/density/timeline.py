@@ -59,7 +59,7 @@ class Timeline:
         return self.start <= step <= self.stop and step % self.interval == 0
 
     def prunes_after(self, step: int) -> bool:
-        """Prune without densification: useless Gaussians cost time."""
+        """Return True if a step prunes without densifying: useless Gaussians cost time."""
         return self.stop < step <= self.prune_stop and step % self.interval == 0
 
 

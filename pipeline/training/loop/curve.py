@@ -10,7 +10,7 @@ from pipeline.runtime.json_file import JsonFile, JsonObject
 
 
 class CurveRecord(JsonObject):
-    """Means since the record before, over training views at the resolution in use."""
+    """The means since the previous record, over training views at the resolution in use."""
 
     step: int = Field(ge=0, description="Number of optimiser steps done.")
     loss: float = Field(description="Of photometric terms.")

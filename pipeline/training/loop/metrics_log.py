@@ -41,7 +41,7 @@ class MetricsLog:
     resumed run keeps the lines up to its step.
 
     Args:
-        path: None writes nothing. Errors of writing are ignored.
+        path: The file; None: nothing is written. Errors of writing are ignored.
         step: The number of steps done.
     """
 

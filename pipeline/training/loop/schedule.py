@@ -14,8 +14,8 @@ from pipeline.training.density.timeline import schedule_length, shrunk
 from pipeline.training.optimisers.adam import Rates
 
 COARSE_FACTORS = (4, 2)
-# Shares of a run at reduced resolution: of its steps; of its minutes, and at most so many minutes.
-# Coarse steps take a third or a ninth of the time of others.
+# The shares of a run's steps and of its minutes at reduced resolution, and the most minutes. Coarse
+# steps take a third or a ninth of the time of others.
 COARSE_STEPS, COARSE_MINUTES, MAX_COARSE_MINUTES = 0.15, 0.1, 1.2
 # The length of the papers' runs. Shorter runs have higher learning rates, by the root of the ratio
 # (as for batch sizes), at most by MAX_FACTOR.

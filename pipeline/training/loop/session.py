@@ -23,9 +23,9 @@ class Session:
 
     Args:
         inputs: The inputs of the run, by which its checkpoints are recognised.
-        state: The state before the part; restored from the newest checkpoint of the run.
+        state: The state before the part. It is restored from the newest checkpoint of the run.
         build: ``Backend.facts``.
-        log: Called with each line for the log.
+        log: The function that is called with each line for the log.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Session:
         Args:
             before: ``state.clock`` before the step.
             factor: The factor by which images are reduced.
-            fetch: Makes the tensors of the state current (``StepEngine.fetch``).
+            fetch: The function that makes the tensors of the state current (``StepEngine.fetch``).
         """
         state, last = self.state, self.run.span.stop
         now = time.monotonic()

@@ -1,4 +1,4 @@
-"""What training works on: the views' pixels, cameras and depths, and the state before step 1."""
+"""The views' pixels, cameras and depths during training, and the state before step 1."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def read_targets(inputs: Inputs, run: TrainingRun) -> Targets:
 
 
 def choose_image_store(inputs: Inputs, run: TrainingRun) -> ImageStore:
-    """Where the pixels of the views are held; see ``read_targets``."""
+    """The storage for the pixels of the views; see ``read_targets``."""
     if run.is_part:
         return DiskStore()
     pixels = sum(view.width * view.height for view in inputs.views)
@@ -117,7 +117,7 @@ def initial_state(
     inputs, options, start = scene.inputs, run.options, run.span.start
     rng = np.random.Generator(np.random.PCG64(run.seed))
     gaussians = inputs.initial if start else inputs.initial.with_sh_degree(0)
-    # A copy: the initial Gaussians stay as they are.
+    # ``in_morton_order`` copies: the initial Gaussians stay as they are.
     gaussians = in_morton_order(_thinned(gaussians, options.density.max_gaussians, rng, warn))
     appearance = None
     if inputs.embeddings is not None:

@@ -19,7 +19,7 @@ from pipeline.training.density import Changes, Strategy, Update
 from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
 
-CURVE_RECORDS = 100  # records of the curve in a run
+CURVE_RECORDS = 100  # The number of records of the curve in a run.
 
 
 @dataclass
@@ -62,9 +62,9 @@ class TrainState:
 
     Attributes:
         clock: The position in the schedule: ``step``, or less or more with a time budget.
-        order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
+        order: (V,) int64, the order of the views in this epoch, of which ``position`` are done.
         appearance: The embeddings of the views; None if appearance is not modelled.
-        curve: Records without times; ``curve_seconds`` has the time of each.
+        curve: The records without times; ``curve_seconds`` has the time of each.
         seconds: The training time so far, in all processes.
     """
 

@@ -61,7 +61,7 @@ class StepEngine(ABC):
         """Change ``state`` by one step.
 
         Raises:
-            UserError: the loss is not finite.
+            UserError: The loss is not finite.
         """
 
     @abstractmethod

@@ -34,12 +34,12 @@ def train(
     """Optimise the initial Gaussians so that their renders match the views.
 
     Args:
-        log: Called with each warning, and with the instruction set and the time per step.
-        backend: The rasterizer's backend; None: that of ``run.options.device``.
+        log: The function that logs each warning, the instruction set and the time per step.
+        backend: The rasterizer's backend; None: the backend of ``run.options.device``.
 
     Raises:
-        UserError: No views or no Gaussians, unreadable images, no view sees a Gaussian, the loss is
-            not finite, or no Gaussian is left.
+        UserError: There are no views or no Gaussians, an image cannot be read, no view sees a
+            Gaussian, the loss is not finite, or no Gaussian is left.
     """
     if not inputs.views or not len(inputs.initial):
         raise UserError(

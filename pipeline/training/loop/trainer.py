@@ -139,7 +139,7 @@ class Trainer:
         return found
 
     def raise_sh_degree(self) -> None:
-        """Coefficients of higher degrees are allocated when they come into use."""
+        """Allocate the coefficients of higher degrees when they come into use."""
         degree = self.schedule.sh_degree_at(self.state.clock)
         if degree > self.state.gaussians.sh_degree:
             self.engine.invalidate()

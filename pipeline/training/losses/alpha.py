@@ -14,8 +14,8 @@ from pipeline.training.data.step_view import StepView
 from pipeline.training.data.targets import Target
 from pipeline.training.losses.plane import PlaneGradients, add
 
-# Without it a block would fade, since what is behind it often has its colour, and each of two
-# blocks on a ray could leave a pixel to the other one.
+# Without this loss, a block would fade, since what is behind it often has its colour, and each of
+# two blocks on a ray could leave a pixel to the other one.
 BLOCK_ALPHA_LOSS = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
 
 
@@ -25,7 +25,7 @@ class AlphaLoss:
 
     Attributes:
         mask_loss_weight: The weight of alpha at ignored pixels (``mask_gradient``).
-        alpha_loss_weight, squared_error_weight: Those of the error at other pixels
+        alpha_loss_weight, squared_error_weight: The weights of the error at other pixels
             (``error_gradient``).
     """
 

@@ -55,10 +55,10 @@ def depth_gradients(
     over alpha. In logarithms, relative errors count the same at all depths.
 
     Args:
-        rendered: ``view`` at full or reduced size.
+        rendered: The render of ``view`` at full or reduced size.
 
     Returns:
-        d_alpha, d_depth: (H, W) float32, for ``render.backward``.
+        The gradients d_alpha and d_depth, (H, W) float32, for ``render.backward``.
     """
     image_alpha = rendered.alpha
     height, width = image_alpha.shape

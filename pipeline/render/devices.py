@@ -52,7 +52,7 @@ def choose_device() -> DeviceChoice:
         reason = f"trained on the processor, since {adapter} fails"
         return DeviceChoice("cpu", reason, f"on the processor; {adapter} fails: {times}")
     gpu, cpu = times
-    compared = f"a step of a made scene takes {1e3 * gpu:.0f} ms on {adapter}, "
+    compared = f"a step of a synthetic scene takes {1e3 * gpu:.0f} ms on {adapter}, "
     compared += f"{1e3 * cpu:.0f} on the processor"
     if gpu < cpu:
         reason = f"trained on {adapter}, where a step takes less time than on the processor"

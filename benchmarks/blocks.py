@@ -41,7 +41,7 @@ TRAINING = ("coarse", "partition", "block", "polish", "train")
 
 
 def compare(results: Path, whole: str, divided: str) -> BlocksResult:
-    """A finished run in blocks beside one of the same scene as one block."""
+    """Compare a finished run in blocks with one of the same scene as one block."""
     folders = results / whole, results / divided
     one, many = map(read_metrics, folders)
     plan = read_plan(results / divided)
@@ -64,7 +64,7 @@ def compare(results: Path, whole: str, divided: str) -> BlocksResult:
 
 
 def _peak(folder: Path, stages: Collection[str] | None = None) -> float:
-    """Largest memory of a job of these stages, or of any, MiB."""
+    """The largest memory of a job of these stages, or of any job, MiB."""
     runs = read_runs(read_metrics(folder), folder)
     return max(run.peak_rss_mb for stage, run in runs.items() if stages is None or stage in stages)
 
@@ -75,7 +75,7 @@ def _cpu(folder: Path) -> float:
 
 
 def _largest_block(folder: Path) -> float:
-    """CPU seconds of the block that takes longest, both rounds together."""
+    """The CPU seconds of the block that takes longest, both rounds together."""
     jobs = read_plan(folder).stages["polish"].jobs
     return max(
         sum(read_run(folder / f"{stage}_{number}").cpu_s for stage in ("block", "polish"))
@@ -106,13 +106,13 @@ class _Renders:
         self.at_seams, self.elsewhere = _Sum(), _Sum()
 
     def error(self, view: View) -> NDArray[np.float64]:
-        """(H, W) mean absolute difference of the channels from the photograph."""
+        """The mean absolute difference of the channels from the photograph, (H, W)."""
         with Image.open(self.folder / "renders" / self.files[view.name]) as picture:
             return np.abs(np.asarray(picture, np.float64) - load_view(view).rgb).mean(2)
 
 
 def _seams(whole: Path, divided: Path) -> tuple[float, float]:
-    """Mean gradient of the error images of the test views across the seams of the second run,
+    """The mean gradient of the error images of the test views across the seams of the second run,
     divided by that elsewhere, in both runs.
 
     Both are over pairs of neighbouring pixels on one surface. A seam is between pixels that
@@ -144,7 +144,7 @@ def _seams(whole: Path, divided: Path) -> tuple[float, float]:
 def _owners(
     gaussians: Gaussians, partition: Partition, view: View, options: RasterOptions
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """(H, W) the block that explains most of each pixel, and the median depth."""
+    """The block that explains most of each pixel, and the median depths, both (H, W)."""
     means, count = gaussians.means.numpy(), len(partition.blocks)
     shares, white = [], 0.5 / SH_C0
     depth = None

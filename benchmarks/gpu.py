@@ -40,11 +40,11 @@ PHASES = {
     "projection backward": ("project_backward",),
     "Adam, statistics": ("observe", "frame_adam", "adam.elements"),
 }  # fmt: skip
-COPIED = 1 << 28  # bytes, of the measurement of bandwidth
+COPIED = 1 << 28  # The number of bytes that the measurement of bandwidth copies.
 
 
 def median_seconds(calls: Sequence[Callable[[], object]], turns: int) -> list[float]:
-    """Median wall time of each call, measured in turns after one call each."""
+    """The median wall time of each call, measured in turns after one call each."""
     times: list[list[float]] = [[] for _ in calls]
     for turn in range(turns + 1):
         for call, found in zip(calls, times, strict=True):
@@ -56,7 +56,7 @@ def median_seconds(calls: Sequence[Callable[[], object]], turns: int) -> list[fl
 
 
 def bandwidth(gpu: Gpu) -> float:
-    """Bytes read and written per second by copies inside the device's memory."""
+    """The bytes read and written per second by copies inside the device's memory."""
     size = min(COPIED, gpu.max_bytes // 4 * 4)
     source, target = gpu.empty(size), gpu.empty(size)
 
@@ -108,8 +108,8 @@ def measure(scene: Scene, backend: GpuBackend, turns: int) -> GpuResult:
 
 
 def _sh_bytes(scene: Scene) -> float:
-    """Bytes of the SH coefficients and their moments that a step reads and writes at least, if all
-    Gaussians are in view."""
+    """The bytes of the SH coefficients and their moments that a step reads and writes at least, if
+    all Gaussians are in view."""
     return 6.0 * 4 * scene.gaussians[4].numel()
 
 

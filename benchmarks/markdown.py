@@ -24,11 +24,7 @@ def cell(value: float | None, form: str) -> str:
 
 
 def middle(values: Sequence[float], form: str) -> str:
-    """The median, and of several values half their range.
-
-    Args:
-        form: The format string, such as "{:.2f}".
-    """
+    """The median, and of several values half their range, in a format such as "{:.2f}"."""
     median = form.format(statistics.median(values))
     if len(values) == 1:
         return median

@@ -72,11 +72,7 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measured(benchmark: str, note: str, arguments: Sequence[str] | None = None) -> Measured:
-    """Facts about this machine, checkout and command.
-
-    Args:
-        arguments: The arguments of the command line; None for this process's.
-    """
+    """Facts about this machine, checkout and command; ``arguments`` are this process's if None."""
     build.library().build()  # Child processes may have used the library, and this one not.
     return Measured(
         benchmark=benchmark,

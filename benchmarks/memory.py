@@ -32,7 +32,7 @@ from pipeline.training.loop import session
 from pipeline.training.loop.train import train
 from pipeline.training.run import TrainingRun
 
-PIXELS_ACROSS = 3.0  # 3-sigma radius of a Gaussian
+PIXELS_ACROSS = 3.0  # The 3-sigma radius of a Gaussian.
 
 
 def made_views(count: int, width: int, height: int, folder: Path) -> list[View]:

@@ -438,7 +438,7 @@ def first_failure(project: Path, tests: Sequence[str]) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests],
         cwd=project,
-        # Compiled anew: a changed kernel has a key of its own.
+        # A changed kernel has a key of its own, so it is compiled anew.
         env=os.environ
         | {"SPLATMAKE_CACHE": str(project.parent / "native"), "PYTHONPATH": str(project)},
         stdout=subprocess.PIPE,
@@ -456,7 +456,7 @@ def first_failure(project: Path, tests: Sequence[str]) -> str:
 
 
 def try_mutant(name: str, project: Path) -> Result:
-    """Put the fault in, run its tests, take it out again."""
+    """Insert the fault, run its tests, and remove it again."""
     mutant = MUTANTS[name]
     file = project / mutant.file
     text = file.read_text()

@@ -181,7 +181,7 @@ class Tally:
 
 
 def run(name: str, call: int, tally: Tally, backend: Backend) -> None:
-    """One call: ``PER_CALL`` cases of a family, forward, backward and the reference."""
+    """Run one call: ``PER_CALL`` cases of a family, forward, backward and the reference."""
     rng = np.random.default_rng([list(FAMILIES).index(name), call])
     case = Case(rng)
     with np.errstate(all="ignore"):

@@ -21,7 +21,7 @@ from typing import Any
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import EXIT_USER_ERROR
 
-# Stages that find the poses and make the training images.
+# The stages that find the poses and make the training images.
 POSES = (
     *("decode", "extract", "features", "pairs", "match", "matches", "sfm"),
     *("refine", "undistort"),
@@ -37,7 +37,7 @@ PROTOCOL = (
     "poses",
     "published",
 )
-# Of the same machine and build, wherever the run was.
+# The runs of a record agree in these facts: they are of one machine and build.
 SAME = ("commit", "processor", "cores", "memory_mb", "instruction_set", "compiler", "threads")
 
 
@@ -48,7 +48,7 @@ class NotComparable(ValueError):
 def scene_record(
     folders: Sequence[Path], command: str, note: str = "", training: str = ""
 ) -> dict[str, Any]:
-    """What runs of one scene measured, as stored.
+    """The record of runs of one scene, as it is stored.
 
     Args:
         training: The preset, or what else names the training in tables.

@@ -37,7 +37,7 @@ GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
 GROWTH_HEADING = [
     *("mapper", "views", "CPU s", "grows as N^", "MiB", "images", "rotation, deg", "centre, m"),
 ]
-# Number of photographs for which growth is extrapolated.
+# The number of photographs for which growth is extrapolated.
 EXTRAPOLATED = 100_000
 Stored = Mapping[str, Any]
 """A record as read from JSON."""
@@ -217,7 +217,7 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
     return markdown.table(rows)
 
 
-#: Kind of table -> the type of the results in its records, and what makes the table.
+#: Kind of table -> the type of the results in its records, and the function that makes the table.
 TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "memory": (MemoryResult, memory),
     "sfm": (summary.Run, lambda found: summary.table(summary.summaries(found))),

@@ -87,7 +87,7 @@ class GrowthResult:
 
 @dataclass(frozen=True)
 class JudgeResult:
-    """Result of a case; ``truth`` is None without ground truth."""
+    """The result of a case; ``truth`` is None without ground truth."""
 
     case: str
     seed: int
@@ -111,7 +111,7 @@ class JudgeResult:
 
 @dataclass(frozen=True)
 class StabilityResult:
-    """Outcome of a case.
+    """The outcome of a case.
 
     Attributes:
         what: The case in words.
@@ -212,8 +212,8 @@ class BlocksResult:
         training_cpu_s: The CPU seconds of all training jobs.
         largest_block_cpu_s: The CPU seconds of the block that takes longest.
         seam_gradient: The mean gradient of the error images of the test views across the seams of
-            the blocks, divided by that elsewhere. The first run has no seams: its value is that of
-            what the photographs show there.
+            the blocks, divided by that elsewhere. The first run has no seams, so its value comes
+            from what the photographs show there.
     """
 
     run: str

@@ -18,7 +18,7 @@ from benchmarks.results import ScalingResult
 from pipeline.plan.record import read_plan
 from pipeline.runtime.record import RUN, read_run
 
-# Stages that a scene of few photographs does in one job, with those of many.
+# Step -> its stages. One of them does the step alone in a scene of few photographs.
 STEPS = {
     "features": ("extract", "features"),
     "matches": ("pairs", "match", "matches"),
@@ -27,11 +27,7 @@ STEPS = {
 
 
 def stage_results(folder: Path, only: Collection[str] = ()) -> list[ScalingResult]:
-    """Each stage of a run, without stages that have not finished.
-
-    Args:
-        only: The names of stages; if empty, all stages, those of ``STEPS`` together.
-    """
+    """The finished stages of a run: those in ``only``, or all, with those of ``STEPS`` together."""
     plan = read_plan(folder)
     step_of = {stage: step for step, stages in STEPS.items() for stage in stages if not only}
     found: dict[str, list[Path]] = {}

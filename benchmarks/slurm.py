@@ -39,7 +39,7 @@ def run(nodes: int, blocks: int, steps: int) -> SlurmResult:
         config = [f"train={json.dumps({'steps': steps})}"]
         config += [f"partition={json.dumps({'blocks': blocks})}"] if blocks > 1 else []
         with running(folder, nodes) as cluster:
-            # Compiled before the clock starts, as on a cluster that has run a scene before.
+            # Kernels are compiled before the clock starts, as on a cluster after its first scene.
             for module in MODULES:
                 _python(project, "-m", module, "--target", "all")
             started = time.monotonic()
@@ -59,7 +59,7 @@ def run(nodes: int, blocks: int, steps: int) -> SlurmResult:
 
 @dataclass(frozen=True, order=True)
 class JobTimes:
-    """Start and end of a job in seconds, and Snakemake's comment, which names its rule."""
+    """The start and end of a job in seconds, and Snakemake's comment, which names its rule."""
 
     start: float
     end: float
@@ -72,7 +72,7 @@ class JobTimes:
 
 
 def blocks_span(jobs: Sequence[JobTimes]) -> float | None:
-    """Seconds from the start of the first job of a block to the end of the last one."""
+    """The seconds from the start of the first job of a block to the end of the last one."""
     found = [job for job in jobs if job.rule.startswith(("rule_block_", "rule_polish_"))]
     if not found:
         return None

@@ -75,11 +75,8 @@ class Cluster:
     controllers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def run(self, *command: str, check: bool = True) -> str:
-        """Run a program of Slurm and return what it prints.
-
-        Args:
-            check: Whether to repeat it for a minute until it succeeds, while the controller starts.
-        """
+        """Run a program of Slurm and return what it prints; with ``check``, repeat it for up to a
+        minute until it succeeds, because the controller may still be starting."""
         end = time.monotonic() + 60
         while True:
             done = subprocess.run(

@@ -56,7 +56,7 @@ def scenes(records: Sequence[Record]) -> str:
         minutes = [
             _minutes(runs, stages) for stages in (POSES, ("train",), tuple(runs[0]["cpu_s"]))
         ]
-        if "report" not in runs[0]["cpu_s"]:  # of training alone
+        if "report" not in runs[0]["cpu_s"]:  # The record is of training alone.
             minutes[2] = "-"
         rows.append(
             [
@@ -152,7 +152,7 @@ def _memory(runs: Sequence[Record]) -> str:
 
 
 def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
-    """CPU minutes of some stages; a dash where none was recorded."""
+    """The CPU minutes of some stages; a dash where none was recorded."""
     if not runs[0]["cpu_s"].keys() & set(stages):
         return "-"
     sums = [sum(run["cpu_s"].get(stage, 0.0) for stage in stages) / 60 for run in runs]
@@ -160,7 +160,7 @@ def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
 
 
 def stages(records: Sequence[Record]) -> str:
-    """CPU seconds of each stage of one scene, in the order of the DAG, and their sum."""
+    """The CPU seconds of each stage of one scene, in the order of the DAG, and their sum."""
     (record,) = records
     seconds = record["runs"][0]["cpu_s"]
     order = [name for name in STAGES if name in seconds]

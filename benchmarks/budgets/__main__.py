@@ -27,7 +27,7 @@ from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.machine import machine_facts, usable_cores
 
 MINUTES = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
-# Load per core of other programs above which times are not those of the machine.
+# Above this load per core of other programs, times are not those of the machine.
 HIGH_LOAD = 0.3
 
 

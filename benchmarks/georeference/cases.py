@@ -143,7 +143,7 @@ def with_values(**values: object) -> Callable[[int, Tags], Tags]:
 
 
 def swapped_tags(_: int, own: Tags) -> Tags:
-    """Latitude written as longitude, as programs do that take "x, y" for "latitude, longitude"."""
+    """Exchange latitude and longitude, as programs do that take "x, y" for their order."""
     return own | {
         _GPS.GPSLatitude: own[_GPS.GPSLongitude],
         _GPS.GPSLongitude: own[_GPS.GPSLatitude],
@@ -184,7 +184,7 @@ def by_control(
     gps: bool = False,
     origin: Sequence[float] = (47.37, 8.54, 410.0),
 ) -> Case:
-    """Ground control points.
+    """A case of ground control points.
 
     Args:
         count: The number of points.
@@ -234,14 +234,14 @@ def flat(xyz: Array) -> Array:
 
 
 TEXAS = (30.27, -97.74, 150.0)
-#: Codes of projections in feet -> metres per foot, and a place in them.
+#: The code of a projection in feet -> its metres per foot, and a place within it.
 FEET = {
     "EPSG:2277": (1200 / 3937, TEXAS),  # Texas, US survey feet
     "EPSG:2222": (FOOT, (33.4, -110.5, 900.0)),  # Arizona, international feet
 }
-# A projection whose eastings and northings are about equal there.
+# A projection whose eastings and northings are about equal where the surveys are.
 NEAR = "+proj=tmerc +lat_0=42 +lon_0=8.5 +x_0=594000 +datum=WGS84 +units=m"
-#: Name -> case. Of a name, "refused" or "stated" is as good as "right".
+#: Name -> case. The verdicts "refused" and "stated" are as good as "right".
 CASES: dict[str, Case] = {
     **{f"GPS in {count} of 24 photographs": few(count) for count in range(6)},
     "GPS on a line": flight(line),

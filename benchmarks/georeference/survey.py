@@ -24,18 +24,18 @@ Array = NDArray[np.float64]
 _GPS = ExifTags.GPS
 
 WIDTH, HEIGHT, FOCAL = 1600, 1200, 1400.0
-# Standard deviations of the measurements: GPS along an axis and altitudes, metres; marks, pixels.
+# The standard deviations of GPS along an axis and of altitudes, metres, and of marks, pixels.
 GPS_M, ALTITUDE_M, MARK_PX = 1.5, 4.0, 0.7
 
 
 @dataclass(frozen=True)
 class Survey:
-    """A survey.
+    """A synthetic survey.
 
     Attributes:
         origin: The latitude, longitude (degrees) and height (metres) of the origin of ``enu``.
-        enu: (N, 3) camera centres, metres east, north and up.
-        rotations: (N, 3, 3) from east, north, up to the camera.
+        enu: The camera centres, (N, 3), metres east, north and up.
+        rotations: The rotations from east, north, up to the cameras, (N, 3, 3).
         model: The similarity from the frame of structure from motion to east, north, up.
     """
 
@@ -61,7 +61,7 @@ class Survey:
         )
 
     def geodetic(self, enu: Array) -> Array:
-        """(N, 3) latitude, longitude and height of (N, 3) points, by Newton's method."""
+        """The latitude, longitude and height of (N, 3) points, (N, 3), by Newton's method."""
         found = np.tile(self.origin, (len(enu), 1))
         scale = np.array([1.0, 1 / np.cos(np.radians(self.origin[0])), 111_194.0]) / 111_194.0
         for _ in range(20):
@@ -104,11 +104,8 @@ def drone_survey(
     path: Callable[[Array], Array] | None = None,
     origin: Sequence[float] = (47.37, 8.54, 410.0),
 ) -> Survey:
-    """Cameras on two flights over about 100 m by 70 m that look obliquely at the ground.
-
-    Args:
-        path: (N,) positions along the flight in 0..1 -> (N, 3) metres; None: the area.
-    """
+    """Cameras on two flights over about 100 m by 70 m that look obliquely at the ground, or along
+    ``path``: (N,) positions along the flight in 0..1 -> (N, 3) metres."""
     t = (np.arange(count) + 0.5) / count
     if path is None:
         across = np.where(np.arange(count) % 2, -35.0, 35.0)
@@ -204,7 +201,7 @@ def marks(survey: Survey, places: Array, rng: np.random.Generator, views: int = 
 
 
 def ground_places(rng: np.random.Generator, count: int) -> Array:
-    """(count, 3) places on hilly ground."""
+    """Random places on hilly ground, (count, 3)."""
     xy = rng.uniform((-35, -25), (35, 25), (count, 2))
     return np.column_stack([xy, 4 * np.sin(xy[:, 0] / 9) + 3 * np.cos(xy[:, 1] / 7)])
 

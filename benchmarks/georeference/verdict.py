@@ -16,10 +16,10 @@ from pipeline.sfm.georeference import WorldFrame, uncertainty
 
 Array = NDArray[np.float64]
 
-# A frame is close to the truth up to these errors, of GPS and of ground control points: scale,
+# A frame is close to the truth up to these errors, of GPS and of ground control points: the scale,
 # angles in degrees, metres horizontally and vertically.
 CLOSE = {"gps": (0.03, 3.0, 6.0, 15.0), "gcp": (0.01, 1.0, 1.0, 1.0)}
-# Errors of up to so many stated standard deviations are explained by them.
+# The number of stated standard deviations up to which they explain an error.
 SIGMAS = 4.0
 #: Words of messages that say that the frame may be wrong.
 DOUBTS = ("contradict", "check", "left out", "wrong", "are not used", "upside down", "outside of")
@@ -59,13 +59,13 @@ def verdict(name: str, found: Found, seed: int) -> GeoreferenceResult:
 
 
 def frame_errors(found: Found) -> tuple[float, float, float, float]:
-    """Relative error of the scale; the largest angle between true and found directions, degrees;
-    and the largest errors of the cameras' places, horizontally and vertically, metres."""
+    """The relative error of the scale; the largest angle between true and found directions,
+    degrees; and the largest errors of the cameras' places, horizontally and vertically, metres."""
     survey, frame = found.survey, found.frame
     assert frame is not None
     ours = frame.similarity(survey.cameras.centres)
     true = true_places(found, frame)
-    # Both around their mean: projections stretch lengths and turn the north.
+    # Both are centred, because projections stretch lengths and turn the north.
     a, b = ours - ours.mean(0), true - true.mean(0)
     u, singular, vt = np.linalg.svd(a.T @ b)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -87,13 +87,13 @@ def frame_errors(found: Found) -> tuple[float, float, float, float]:
 
 
 def turned(found: Found, frame: WorldFrame) -> float:
-    """Angle between the found and the true rotation, degrees, where the cameras are on a line."""
+    """The angle between found and true rotation, degrees, where the cameras are on a line."""
     turn = frame.similarity.rotation @ found.survey.model.rotation.T
     return float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
 
 
 def true_places(found: Found, frame: WorldFrame) -> Array:
-    """(N, 3) true places of the cameras in the coordinates of the found frame."""
+    """The true places of the cameras in the coordinates of the found frame, (N, 3)."""
     survey, origin = found.survey, frame.origin
     places = survey.geodetic(survey.enu)
     if isinstance(origin, GeographicOrigin):

@@ -26,7 +26,7 @@ from pipeline.sfm.attempts import MAX_ATTEMPTS, Attempt, map_until_good
 from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.models import quiet_colmap, write_model
 
-# Printed fields of the evidence: name, heading, format.
+# The printed fields of the evidence: name, heading, format.
 SHOWN = (
     ("explained_matches", "expl", "{:.2f}"),
     ("agreeing_pairs", "agree", "{:.2f}"),
@@ -40,7 +40,7 @@ SHOWN = (
 
 
 def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) -> JudgeResult:
-    """A case of ``cases.CASES``."""
+    """Run a case of ``cases.CASES``."""
     made = write(make(name, seed), folder / "database.db", seed)
     start = time.process_time()
     total = len(made.manifest.photos)
@@ -54,7 +54,7 @@ def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) ->
 def run_folder(
     name: str, seed: int, found: Matched, mapper: Mapper | None, budget: int
 ) -> JudgeResult:
-    """A folder of photographs, matched and mapped by the plan of the pipeline."""
+    """Match and map a folder of photographs by the plan of the pipeline."""
     start = time.process_time()
     best, records = map_until_good(
         found.database, mapper or found.mapper, found.total, found.min_share, seed, budget

@@ -91,8 +91,8 @@ def _turning(rng: np.random.Generator, count: int, sway: float) -> Made:
 
 
 def _tower(rng: np.random.Generator, count: int, sides: int, unlike: float, ground: int) -> Made:
-    """Around a building of ``sides`` equal sides; ``unlike`` is the share of points that only one
-    side has; ``ground`` is the number of points of the ground, all different."""
+    """Cameras around a building of ``sides`` equal sides; ``unlike`` is the share of points that
+    only one side has; ``ground`` is the number of points of the ground, all different."""
     per_side = 1000
     base = plane(rng, (-1, -1, 0), (2, 0, 0), (0, 0, 2.4), per_side, -0.25)
     total = None
@@ -126,8 +126,8 @@ def _tower(rng: np.random.Generator, count: int, sides: int, unlike: float, grou
 
 
 def _windows(rng: np.random.Generator, count: int, unlike: float) -> Made:
-    """Along a facade of equal windows, so near that a picture shows less than two; ``unlike`` is
-    the share of points that do not repeat."""
+    """Cameras along a facade of equal windows, so near that a picture shows less than two;
+    ``unlike`` is the share of points that do not repeat."""
     period, length = 3.0, 24.0
     wall = plane(rng, (-3, 2.2, 0), (length, 0, 0), (0, 0, 4), 9000, 0.3)
     tile = np.floor((wall.xyz[:, 0] + 3) / period)
@@ -240,7 +240,7 @@ def _plain(rng: np.random.Generator) -> Made:
 
 
 CASES: dict[str, Case] = {
-    # Should succeed.
+    # Captures that should succeed.
     "orbit": orbit,
     "orbit_prior_right": _with_prior(orbit, 1.0),
     "orbit_camera_each": _cameras_each,
@@ -255,10 +255,10 @@ CASES: dict[str, Case] = {
     "outliers_30": _outliers,
     "duplicates": _duplicates,
     "mirrored_third": _mirrored,
-    # Partial models.
+    # Captures that give partial models.
     "two_rooms": _two_rooms,
     "mixed_three": _mixed,
-    # Plausible but wrong models, and failures.
+    # Captures that give plausible but wrong models, or none.
     **{f"prior_x{f}": _with_prior(orbit, f) for f in (0.3, 0.5, 0.7, 1.5, 2.0, 3.0)},
     **{
         f"row_prior_x{f}": _with_prior(lambda rng: _facing(rng, 14, 0.35, 0.8), f)

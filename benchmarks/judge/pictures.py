@@ -27,7 +27,7 @@ PICTURES: dict[str, Look] = {
     "pictures_blurred": "blurred",
 }
 VIEWS, WIDTH, HEIGHT = 14, 320, 240
-# Sigma of the blur, pixels, at a width of 320.
+# The sigma of the blur, pixels, at a width of 320.
 BLUR = 5.0
 
 
@@ -44,7 +44,7 @@ class Matched:
 
 def write_pictures(name: str, seed: int, folder: Path) -> None:
     """Render a case of ``PICTURES``: the demo scene, unchanged, without texture, or blurred."""
-    # Runs in a separate process, because cv2 and pycolmap conflict.
+    # This runs in a separate process, because cv2 and pycolmap conflict.
     import cv2
     import numpy as np
     from PIL import Image
@@ -58,7 +58,7 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
 
     look = PICTURES[name]
     names = [f"view_{i:03d}.png" for i in range(VIEWS)]
-    # An arc: the same number of views on a full ring would be too far apart.
+    # The views are on an arc: on a full ring, the same number would be too far apart.
     views = orbit(names, seed)
     camera = lens("simple_radial", WIDTH, HEIGHT)
     through = rays(camera)
@@ -69,7 +69,7 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
         if look == "blurred":
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), BLUR), np.float64)
         if look == "bare":
-            # Removes the texture; shading and edges remain.
+            # The blur removes the texture; shading and edges remain.
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), 12.0), np.float64) * 0.2 + 0.3
         noisy = srgb(light) + rng.normal(0, 0.004, light.shape)
         Image.fromarray(to_bytes(noisy)).save(folder / "images" / posed.name)
@@ -78,8 +78,8 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
 
 
 def match_folder(folder: Path, work: Path, seed: int) -> Matched:
-    """Features and matches of the photographs of a scene, by its plan, without its given poses; or
-    those of a finished scene (``results/NAME``)."""
+    """The features and matches of the photographs of a scene, by its plan, without its given poses;
+    or those of a finished scene (``results/NAME``)."""
     if (folder / "plan.json").is_file():
         return _finished(folder, work)
     config = Config(poses="ignore", seed=seed)

@@ -16,10 +16,10 @@ from pipeline.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 Grade = Literal["good", "weak", "failed"]
 
-# Error bounds of a correct view, after the similarity with the most correct views.
+# The error bounds of a correct view, after the similarity with the most correct views.
 ROTATION_DEG, CENTRE_SHARE = 5.0, 0.05
-# Shares of correct views among those with a pose and a true one: good from the first, failed below
-# the second.
+# The shares of correct views among those with a pose and a true one: a model is good from the
+# first, and has failed below the second.
 GOOD_SHARE, FAILED_SHARE = 0.9, 0.6
 # A model with a smaller share of the photographs has failed.
 LEAST_REGISTERED = 0.5
@@ -95,15 +95,15 @@ def grade(
 
 
 def _median(values: Array) -> float | None:
-    """None for the infinite residuals without a similarity."""
+    """The median; None for the infinite residuals without a similarity."""
     middle = float(np.median(values))
     return middle if np.isfinite(middle) else None
 
 
 def _residuals(r_found: Array, c_found: Array, r_true: Array, c_true: Array) -> tuple[Array, Array]:
-    """Degrees and distances left by the similarity, of those that one view's rotation and two
-    views' distance propose and of the least-squares ones on what these explain, that makes most
-    views right."""
+    """The degrees and distances that the best similarity leaves: the one that makes most views
+    right, of those that one view's rotation and two views' distance propose, and of the
+    least-squares ones on what these explain."""
     rng = np.random.default_rng(0)
     count = len(c_true)
     radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))

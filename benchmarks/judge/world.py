@@ -28,13 +28,13 @@ Ints = NDArray[np.int64]
 WIDTH, HEIGHT = 640, 480
 FOCAL, RADIAL = 560.0, -0.06
 NOISE_PX = 0.5
-# Share of the points in view that are detected, and of those in two images that are matched.
+# The shares of the points in view that are detected, and of those in two images that are matched.
 DETECTED, MATCHED = 0.75, 0.85
-# Angle between two views at which half of the matches of SIFT are lost.
+# The angle between two views at which half of the matches of SIFT are lost.
 HALF_ANGLE_DEG = 30.0
 MAX_GRAZING_DEG = 72.0
 MAX_SCALE_RATIO = 2.5
-# Wrong matches of a pair that pass the ratio test: a share of the correct ones, plus a number.
+# The wrong matches of a pair that pass the ratio test: a share of the correct ones, plus a number.
 WRONG_SHARE, WRONG_MATCHES = 0.08, 4
 MIN_INLIERS = 15
 
@@ -44,8 +44,8 @@ class Surface:
     """Points of a surface with their appearance.
 
     Attributes:
-        xyz, normal: (P, 3).
-        look: (P,) appearance: points with equal numbers look the same.
+        xyz, normal: The positions and the normals, (P, 3).
+        look: The appearance, (P,): points with equal numbers look the same.
     """
 
     xyz: Array
@@ -117,7 +117,7 @@ def ball(rng: np.random.Generator, centre: Triple, radius: float, count: int) ->
 
 
 def room(rng: np.random.Generator, side: float, count: int) -> Surface:
-    """Floor (z = 0) and four walls, seen from inside."""
+    """The floor (z = 0) and four walls, seen from inside."""
     h, tall = side / 2, 0.5 * side
     each = count // 5
     walls = plane(rng, (-h, -h, 0), (side, 0, 0), (0, side, 0), each)
@@ -201,7 +201,7 @@ def _truth(made: Made, names: Sequence[str], like: Shot) -> Reconstruction:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Keypoints of a photograph: (F, 2) xy, and the point of each, sorted by point."""
+    """The keypoints of a photograph: (F, 2) xy, and the point of each, sorted by point."""
 
     xy: Array
     point: Ints
@@ -286,8 +286,8 @@ def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generat
 
 
 def _presented_angle(ray_a: Array, normal_a: Array, ray_b: Array, normal_b: Array) -> Array:
-    """Angle in degrees between two observations: for one point, between its rays; for two points of
-    equal appearance, the difference of their viewing angles."""
+    """The angle in degrees between two observations: for one point, between its rays; for two
+    points of equal appearance, the difference of their viewing angles."""
     same = (np.abs(normal_a - normal_b) < 1e-9).all(1)
     rays = np.degrees(np.arccos(np.clip((ray_a * ray_b).sum(1), -1, 1)))
     slant_a, slant_b = (

@@ -162,7 +162,7 @@ def write_opensfm(folder: Path, poses: list[Pose], mistake: Mistake) -> None:
         camera = pose.camera
         fx, fy, cx, cy = camera.pinhole
         side = max(camera.width, camera.height)
-        # A focal length that was divided by the other side of the image.
+        # This mistake divides a focal length by the other side of the image.
         divisor = min(camera.width, camera.height) if mistake == "other" else side
         k1, k2, p1, p2, k3 = _brown(camera)
         key = f"camera {camera.width}x{camera.height} {fx:.3f}"
@@ -221,7 +221,7 @@ def _rotation_vector(rotation: Array) -> Array:
 
 
 def _heading_pitch_roll(to_world: Array) -> Array:
-    """Angles in radians of Rz(-heading) Rx(pitch) Ry(roll)."""
+    """The angles in radians of Rz(-heading) Rx(pitch) Ry(roll)."""
     heading = -np.arctan2(-to_world[0, 1], to_world[1, 1])
     pitch = np.arcsin(np.clip(to_world[2, 1], -1, 1))
     return np.array([heading, pitch, np.arctan2(-to_world[2, 0], to_world[2, 2])])

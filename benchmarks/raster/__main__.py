@@ -111,7 +111,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
             f"{cpu.median:8.2f} {found['pairs_per_s'] / 1e6:9.1f}"
         )
         if name in costs:
-            # Relative to the peak just before each step: the speed of virtual machines varies.
+            # The shares are of the peak just before each step: virtual machines vary in speed.
             shares = [
                 costs[name].seconds(replace(peak, flops=t.flops)) * 1e3 / t.times[name].cpu
                 for t in turns
@@ -139,7 +139,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
 
 
 def _speedups(first: Step, turns: list[Turn], other: Step, others: list[Turn]) -> dict[str, Any]:
-    """Speed-up of more threads over fewer, turn by turn."""
+    """The speed-up of more threads over fewer, turn by turn."""
     found = {
         name: Spread.of(
             [a.times[name].wall / b.times[name].wall for a, b in zip(turns, others, strict=True)]
@@ -169,7 +169,7 @@ def _against_the_probe(step: Step, probe: Path, turns: int) -> dict[str, Any]:
 
 
 def _scenes(args: argparse.Namespace) -> list[Callable[[], Scene]]:
-    """Scenes are created one by one, because of their size in memory."""
+    """The calls that create the scenes, one by one because of their size in memory."""
     if args.model:
         return [partial(trained, args.model, size) for size in args.sizes or [None]]
     return [

@@ -17,7 +17,7 @@ NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors against the reference.
+    """The errors against the reference.
 
     Attributes:
         colour: The largest error of pixels that are not near a cut-off.
@@ -29,7 +29,7 @@ class Accuracy:
 
 
 def accuracy(step: Step) -> Accuracy:
-    """Errors in the window, for the gradient of a random linear function of its colours.
+    """The errors in the window, for the gradient of a random linear function of its colours.
 
     Gaussians outside the window are excluded from the reference, to limit its memory.
     """
@@ -66,7 +66,7 @@ def accuracy(step: Step) -> Accuracy:
 
 @dataclass(frozen=True)
 class ReferenceRatio:
-    """Forward and backward on a scene small enough for the reference, milliseconds."""
+    """The milliseconds of forward and backward on a scene small enough for the reference."""
 
     scene: str
     reference: float

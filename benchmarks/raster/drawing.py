@@ -14,7 +14,7 @@ from pipeline.render import RasterOptions, make_backend
 
 @dataclass(frozen=True)
 class Drawing:
-    """Milliseconds per frame, over rounds of all views: wall time, and CPU time over threads.
+    """The milliseconds per frame, over rounds of all views: wall time, and CPU time over threads.
 
     Attributes:
         visible: The mean number of Gaussians that touch the image over the views.

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.render.cpu import build
 from pipeline.runtime.machine import machine_facts
 
-# The compiler's macro of each instruction set, best first, and float32 lanes of its registers.
+# The compiler's macro of each instruction set, best first, and the float32 lanes of its registers.
 INSTRUCTION_SETS = (
     ("__AVX512F__", "AVX-512", 16),
     ("__AVX2__", "AVX2", 8),

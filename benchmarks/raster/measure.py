@@ -20,33 +20,33 @@ from pipeline.render.cpu import build
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT = Train().ssim_loss_weight
 SQUARED_ERROR_WEIGHT = DEFAULT.train.squared_error_loss_weight
-MIN_TURNS = 5  # least number for quartiles
+MIN_TURNS = 5  # The least number of turns that has quartiles.
 TILE_PIXELS = 16 * 16
-# Least number of operations of one Gaussian on all pixels of a block: offset 2, exponent 2, 2^x 11,
-# clamping 3, transmittance 3; forward: colour and remaining transmittance 4; backward: offset 2,
-# transmittance 1, gradient of the pixel 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
-# Each takes as many instructions as registers hold the pixels of the block. "Of bound" is the
-# measured time over the time of these instructions at the rate at which the processor starts
-# multiply-adds. It is not a strict bound: processors with further units for other operations start
-# more of them.
+# The least number of operations of one Gaussian on all pixels of a block: offset 2, exponent 2,
+# 2^x 11, clamping 3, transmittance 3; forward: colour and remaining transmittance 4; backward:
+# offset 2, transmittance 1, gradient of the pixel 4, alpha / (1 - alpha) 5, v 4, moments of v and
+# of colour 11. Each takes as many instructions as registers hold the pixels of the block. "Of
+# bound" is the measured time over the time of these instructions at the rate at which the processor
+# starts multiply-adds. It is not a strict bound: processors with further units for other operations
+# start more of them.
 BLOCK_OPERATIONS = {"blend": 25, "blend backward": 48}
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Lower bound of the work of an operator on a scene: float32 operations and bytes."""
+    """The lower bound of the work of an operator on a scene: float32 operations and bytes."""
 
     flops: float
     bytes: float
 
     def seconds(self, peak: Peak) -> float:
-        """Time at the peak of the machine, by the tighter of the two limits."""
+        """The time at the peak of the machine, by the tighter of the two limits."""
         return max(self.flops / peak.flops, self.bytes / peak.bytes)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds: wall time, and CPU time over threads, which depends less on other load."""
+    """The milliseconds of wall time, and of CPU time over threads, which depends less on load."""
 
     wall: float
     cpu: float
@@ -63,7 +63,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median and quartiles over turns."""
+    """The median and quartiles over turns."""
 
     median: float
     low: float
@@ -92,7 +92,7 @@ class Step:
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
         turns = torch.zeros(scene.count, 3), torch.zeros(scene.count, 3)
         last = torch.zeros(scene.count, dtype=torch.int32)
-        # Learning rates of 0, so that every repeat renders the same.
+        # The learning rates are 0, so that every repeat renders the same.
         rate = torch.tensor([1, 0.8, 0.999, 1e-15, 0], dtype=torch.float64)
         rates = torch.tensor([1, 0.8, 0.999, 1e-15, 0, 0], dtype=torch.float64)
         loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
@@ -143,14 +143,14 @@ class Step:
         }
 
     def costs(self, pairs: int) -> dict[str, Cost]:
-        """Lower bounds, given the number of contributing (pixel, Gaussian) pairs: the operations of
-        useful lanes (a multiply-add is two), and every array read or written once."""
+        """The lower bounds, given the number of contributing (pixel, Gaussian) pairs: the
+        operations of useful lanes (a multiply-add is two), and every array read or written once."""
         n, pixels = self.scene.count, self.drawn.alpha.numel()
         visible, tiles = int((self.drawn.radii > 0).sum()), self.drawn.num_intersections
         row = 4 * sum(g[0].numel() for g in self.scene.gaussians) if n else 0
         sh = 4 * self.scene.gaussians[4][0].numel() if n else 0
         record, entry, slot = 64, 12, 64
-        # 8 blurs (5 forward, 3 of the gradient) of 6 taps, twice: 17 operations; some 30 beside
+        # 8 blurs (5 forward, 3 of the gradient) of 6 taps take 17 operations twice; others some 30.
         loss = 3 * pixels * (8 * 2 * 17 + 30)
         return {
             "projection, SH": Cost(n * 400, n * row + visible * record),
@@ -196,14 +196,14 @@ def take_turns(steps: Sequence[Step], calibration: Calibration, seconds: float) 
 
 
 def block_pixels(step: Step) -> int:
-    """Pixels of a block; the kernels' blocks depend on their target."""
+    """The pixels of a block; the kernels' blocks depend on their target."""
     tiles = step.state.tile_begin.numel() - 1
     return TILE_PIXELS * tiles // step.state.block_end.numel()
 
 
 def block_pairs(step: Step) -> int:
-    """Number of (Gaussian, block) pairs to evaluate: those of the bins, up to the point at which
-    the last pixel of a block terminates."""
+    """The number of (Gaussian, block) pairs to evaluate: those of the bins, up to the point at
+    which the last pixel of a block terminates."""
     state = step.state
     counts = state.tile_begin.diff()
     tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
@@ -215,7 +215,7 @@ def block_pairs(step: Step) -> int:
 
 
 def contributing_pairs(step: Step) -> int:
-    """Number of contributing (pixel, Gaussian) pairs of the image, computed in torch by tile."""
+    """The number of contributing (pixel, Gaussian) pairs of the image, from torch, by tile."""
     state = step.state
     width, height = state.projected.size
     tiles_x, tiles_y = -(-width // 16), -(-height // 16)

@@ -18,13 +18,13 @@ TOLERANCE = 0.15
 
 @dataclass(frozen=True)
 class Peak:
-    """Peak of ``threads`` threads: float32 operations and bytes moved per second.
+    """The peak of ``threads`` threads: float32 operations and bytes moved per second.
 
     Attributes:
         instruction_set: The widest instruction set of the processor.
         lanes: The float32 lanes of its registers.
         fused: Whether a multiplication and an addition are one instruction.
-        clock: The cycles a second of one core.
+        clock: The cycles per second of one core.
     """
 
     threads: int
@@ -36,12 +36,12 @@ class Peak:
     clock: float
 
     def instructions(self, flops: float) -> float:
-        """Vector instructions per second at this rate of operations."""
+        """The vector instructions per second at this rate of operations."""
         return flops / self.lanes / (2 if self.fused else 1)
 
     @property
     def per_cycle(self) -> float:
-        """Vector instructions that one core starts per cycle."""
+        """The vector instructions that one core starts per cycle."""
         return self.instructions(self.flops) / (self.threads * self.clock)
 
     @property
@@ -85,8 +85,8 @@ class Calibration:
         self._loaded.peak_name.restype = ctypes.c_char_p
 
     def flops(self, threads: int) -> float:
-        """Operations per second. Takes about 10 ms, so that it can run before every timed step: the
-        speed of virtual machines varies within seconds."""
+        """The operations per second. The loop takes about 10 ms, so that it can run before every
+        timed step: the speed of virtual machines varies within seconds."""
         return self._loaded.peak_flops(threads)
 
     def peak(self, threads: int) -> Peak:

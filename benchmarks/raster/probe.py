@@ -27,7 +27,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Versus:
-    """CPU milliseconds over threads by operator, medians over the turns."""
+    """The CPU milliseconds over threads by operator, medians over the turns."""
 
     ours: dict[str, float]
     theirs: dict[str, float]
@@ -38,7 +38,7 @@ class Versus:
 
     @property
     def step_ratio(self) -> float:
-        """Ratio of our whole step to their three operators."""
+        """The ratio of our whole step to their three operators."""
         return self.ours["step"] / sum(self.theirs.values())
 
 

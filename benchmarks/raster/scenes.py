@@ -83,11 +83,8 @@ def synthetic(count: int, width: int, height: int, radius: float, in_view: float
 
 
 def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
-    """An export folder: its ``point_cloud.ply`` seen by the images of its ``sparse/0``.
-
-    Args:
-        size: The width and height to draw instead of the first image's, which is stretched to it.
-    """
+    """An export folder: its ``point_cloud.ply`` seen by the images of its ``sparse/0``. Every image
+    is stretched to ``size`` (width, height), or to the size of the first one."""
     arrays = read_splat_ply(folder / "point_cloud.ply")
     model = read_model(folder / "sparse" / "0")
     posed = sorted(model.images.values(), key=lambda image: image.name)

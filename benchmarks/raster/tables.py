@@ -33,7 +33,7 @@ def table(records: Sequence[dict[str, Any]]) -> str:
 
 
 def steps_table(records: Sequence[dict[str, Any]]) -> str:
-    """Medians of a step's phases in each build of one record, ms of wall time."""
+    """The medians of a step's phases in each build of one record, ms of wall time."""
     (record,) = records
     builds: dict[str, dict[str, float]] = record["ms"]
     rows = [["", *builds]]

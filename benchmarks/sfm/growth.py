@@ -41,7 +41,7 @@ WRONG = 0.1
 
 
 def street(count: int) -> list[tuple[Array, Array]]:
-    """World-to-camera pose of each photograph."""
+    """The world-to-camera pose of each photograph."""
     rng = np.random.default_rng(0)
     found = []
     for index in range(count):
@@ -56,11 +56,8 @@ def street(count: int) -> list[tuple[Array, Array]]:
 
 
 def make_database(path: Path, count: int, points: int) -> None:
-    """Verified matches between each camera and the next five.
-
-    Args:
-        points: The approximate number of points per photograph.
-    """
+    """Write verified matches between each camera and the next five, with about ``points`` points
+    per photograph."""
     import pycolmap
 
     from pipeline.sfm.models import quiet_colmap

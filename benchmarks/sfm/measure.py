@@ -20,7 +20,7 @@ from pipeline.scene.manifest import Manifest
 
 
 def run_once(scene: Scene, configuration: Configuration | None, threads: int) -> Run:
-    """One run from photographs to poses; None for pycolmap's defaults."""
+    """Run a configuration from photographs to poses; None is pycolmap's defaults."""
     with tempfile.TemporaryDirectory(prefix="benchmark-sfm-") as name:
         folder = Path(name)
         if configuration is None:

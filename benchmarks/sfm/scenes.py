@@ -32,7 +32,7 @@ class Scene:
     Attributes:
         scan: The scan of the photographs to be used, as if no poses were given.
         truth: The poses of these photographs alone.
-        truth_kind: "truth" from ``sparse_gt``, or "given poses", themselves a reconstruction.
+        truth_kind: Either "truth" (``sparse_gt``) or "given poses", themselves a reconstruction.
     """
 
     name: str
@@ -90,8 +90,8 @@ def load_scene(folder: Path, every: int = 1) -> Scene:
 
 
 def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]:
-    """Configurations that match one of the ``patterns`` (``*`` matches anything; "plan" matches the
-    choice of the plan for each preset)."""
+    """The configurations that match one of the ``patterns`` (``*`` matches anything; "plan" matches
+    the choice of the plan for each preset)."""
     possible = [
         pairs
         for pairs in PAIRS

@@ -20,7 +20,7 @@ HEADING = [
 
 @dataclass(frozen=True)
 class Cost:
-    """CPU seconds of a step, without imports, and its peak memory, MiB."""
+    """The CPU seconds of a step, without imports, and its peak memory, MiB."""
 
     cpu_s: float
     peak_mb: float
@@ -53,7 +53,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Summary:
-    """Medians over the runs of a configuration on a scene, of those that gave a model.
+    """The medians over the runs of a configuration on a scene, of those that gave a model.
 
     Attributes:
         cpu_s: The CPU seconds of each step; ``total_s`` is their sum.
@@ -87,7 +87,7 @@ def summaries(runs: Sequence[Run]) -> list[Summary]:
 
 
 def summarise(runs: Sequence[Run]) -> Summary:
-    """Summary of at least one run of a configuration on a scene."""
+    """The summary of at least one run of a configuration on a scene."""
     done = [run for run in runs if run.error is not None]
     timed = done or list(runs)
 

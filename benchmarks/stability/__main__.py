@@ -26,7 +26,7 @@ from benchmarks.results import StabilityResult
 from benchmarks.stability.cases import CASES, Case, write_room
 
 ROOT = Path(__file__).resolve().parents[2]
-# Difference in PSNR that rounding in another world frame may cause.
+# The difference in PSNR that rounding in another world frame may cause.
 TOLERANCE_DB = 0.1
 CONFIG: dict[str, Any] = {
     "views": {"max_long_side_px": 200},

@@ -30,9 +30,9 @@ Pixels = NDArray[Any]
 Expected = Literal["same", "works", "error"]
 
 VIEWS, WIDTH, HEIGHT = 20, 200, 150
-# Focus of the demo cameras.
+# The focus of the demo cameras.
 MIDDLE = np.array([0.0, 0.0, 0.45])
-# Rotation of the rotated world; not about a coordinate axis.
+# The rotation of the rotated world, which is not about a coordinate axis.
 TURN = quat_to_rotation(np.array([0.3, -0.7, 0.5, 0.2]))
 
 
@@ -44,8 +44,8 @@ class Case:
         make: The function that writes the scene into an existing, empty folder. Its second
             argument is the folder of the base scene, with poses and points.
         what: The description for the table.
-        expected: "same": the quality is the reference's within ``__main__.TOLERANCE_DB``; "works":
-            a result, with a PSNR of at least ``least``; "error": one clear message.
+        expected: One of "same" (the reference's quality within ``__main__.TOLERANCE_DB``), "works"
+            (a result with a PSNR of at least ``least``) and "error" (one clear message).
         reference: The case whose quality it should have.
         config: The options beside the tiny run's.
     """
@@ -96,7 +96,7 @@ def world(
 
 
 def transforms(scale: float, shift: float) -> Callable[[Path, Path], None]:
-    """transforms.json without points, which the pipeline then triangulates."""
+    """A scene with transforms.json and without points, which the pipeline then triangulates."""
 
     def make(folder: Path, room: Path) -> None:
         away = shift * np.array([0.6, -0.64, 0.48])
@@ -206,21 +206,21 @@ def _untracked(points: Points, alone: bool) -> Points:
 
 
 def ring(radius: float = 2.3, height: float = 1.25, bob: float = 0.3) -> Array:
-    """(VIEWS, 3) positions on two thirds of a circle around the objects."""
+    """Positions on two thirds of a circle around the objects, (VIEWS, 3)."""
     angle = np.radians(np.arange(VIEWS) * 12.0)
     tall = height + bob * np.sin(3 * angle)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), tall], 1)
 
 
 def grid() -> Array:
-    """(VIEWS, 3) positions in a vertical plane in front of the objects, uneven by a centimetre."""
+    """Positions in a vertical plane in front of the objects, uneven by a centimetre, (VIEWS, 3)."""
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(0.6, 1.5, 4))
     y = -2.3 + 0.005 * np.random.default_rng(0).standard_normal(x.shape)
     return np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
 
 
 def spot() -> Array:
-    """(VIEWS, 3) equal positions."""
+    """Equal positions, (VIEWS, 3)."""
     return np.tile([1.9, -1.3, 1.25], (VIEWS, 1))
 
 
@@ -233,7 +233,7 @@ def about(centres: Array, spread: float = 0.1) -> Array:
 
 
 def write(path: Path, pixels: Pixels) -> None:
-    """RGB, RGBA or grey pixels, 8 or 16 bits, in the format of the file name."""
+    """Write RGB, RGBA or grey pixels, 8 or 16 bits, in the format of the file name."""
     order = {2: pixels, 3: pixels[..., ::-1]} if pixels.ndim == 3 else {2: pixels}
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         order[3] = pixels[..., [2, 1, 0, 3]]
@@ -279,7 +279,7 @@ def shrunk(rgb: Pixels, number: int) -> Pixels:
 
 
 def exposed(factor: float, every: int = 1) -> Callable[[Pixels, int], Pixels]:
-    """Values of every n-th photograph multiplied by ``factor``, clipped."""
+    """A change that multiplies every n-th photograph by ``factor`` and clips it."""
 
     def change(rgb: Pixels, number: int) -> Pixels:
         return (

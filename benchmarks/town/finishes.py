@@ -27,8 +27,8 @@ class Finish:
 
 
 def painted(finish: Finish, width: float, height: float) -> Floats:
-    """(rows, columns, 3) linear albedo of a face of ``width`` times ``height`` metres, from its top
-    left, in texels of ``TEXEL``: noise of all wavelengths, and rectangles."""
+    """The linear albedo of a face of ``width`` times ``height`` metres, (rows, columns, 3), from
+    its top left, in texels of ``TEXEL``: noise of all wavelengths, and rectangles."""
     rng = np.random.default_rng(finish.seed)
     rows, columns = (max(2, round(side / TEXEL)) for side in (height, width))
     brightness = 1 + np.float32(0.22) * fractal(rng, rows, columns, 1.0, _COARSEST / TEXEL)

@@ -37,7 +37,8 @@ class Ground:
 
     Attributes:
         map: The shares of sun, sky, paving and town at each place, of 255.
-        corner: (2,) its lower left corner; ``texel`` its resolution, metres.
+        corner: The map's lower left corner, (2,), metres.
+        texel: The map's resolution, metres.
         noise: The periodic tile.
     """
 
@@ -47,11 +48,8 @@ class Ground:
     noise: Pyramid
 
     def albedo_and_light(self, x: Floats, y: Floats, blur: Floats) -> tuple[Floats, Floats]:
-        """(N, 3) albedo and (N, 3) irradiance at positions.
-
-        Args:
-            blur: (N,) width of the texture filter, metres.
-        """
+        """The (N, 3) albedo and irradiance at positions; ``blur`` is the (N,) width of the texture
+        filter, metres."""
         level = np.log2(np.maximum(blur / np.float32(self.texel), 1e-3))
         u = (x - np.float32(self.corner[0])) / np.float32(self.texel)
         v = (y - np.float32(self.corner[1])) / np.float32(self.texel)
@@ -64,7 +62,7 @@ class Ground:
         return albedo, light
 
     def _layer(self, x: Floats, y: Floats, blur: Floats, texel: float, angle: float) -> Floats:
-        """(N, 4) noise of unit deviation."""
+        """Noise of unit deviation, (N, 4)."""
         c, s = np.float32(np.cos(angle) / texel), np.float32(np.sin(angle) / texel)
         level = np.log2(np.maximum(blur / np.float32(texel), 1e-3))
         values = self.noise.sample(c * x + s * y, c * y - s * x, level)
@@ -106,7 +104,7 @@ def ground_of(town: Town) -> Ground:
 
 
 def _outline(solid: Solid) -> Array:
-    """(N, 3) points whose convex hull has about the solid's shadow."""
+    """Points whose convex hull has about the solid's shadow, (N, 3)."""
     if not isinstance(solid, Ellipsoid):
         return solid.vertices
     i = np.arange(80)
@@ -134,7 +132,7 @@ def _tinted(colour: tuple[float, float, float], factor: Floats) -> Floats:
 
 
 def _lay(albedo: Floats, share: Floats, layer: tuple[Floats, Floats]) -> None:
-    """Cover with (N, 3) colours by (N,) shares, in place."""
+    """Cover the albedo with (N, 3) colours by (N,) shares, in place."""
     colour, cover = layer
     albedo += (share * cover)[:, None] * (colour - albedo)
 
@@ -147,12 +145,12 @@ def _meadow(layers: list[Floats]) -> Floats:
 
 
 def _edge(inside: Floats, blur: Floats) -> Floats:
-    """1 where ``inside`` is positive, 0 where negative, with an edge as wide as the filter."""
+    """Return 1 where ``inside`` is positive, else 0, with an edge as wide as the filter."""
     return np.clip(inside / np.maximum(blur, np.float32(0.01)) + np.float32(0.5), 0, 1)
 
 
 def _joints(x: Floats, y: Floats, blur: Floats, size: float) -> tuple[Floats, Floats]:
-    """Share of joints between square slabs, and a tint of each slab of about unit deviation."""
+    """The share of joints between square slabs, and a tint of each slab of about unit deviation."""
     u, v = x / np.float32(size), y / np.float32(size)
     i, j = np.floor(u), np.floor(v)
     near = np.minimum(np.minimum(u - i, i + 1 - u), np.minimum(v - j, j + 1 - v))
@@ -174,7 +172,7 @@ def _paving(x: Floats, y: Floats, blur: Floats, layers: list[Floats]) -> Floats:
 
 
 def _street(x: Floats, y: Floats, blur: Floats, layers: list[Floats]) -> tuple[Floats, Floats]:
-    """Colours of the street's surface, and its share of the ground."""
+    """The colours of the street's surface, and its share of the ground."""
     length, width = np.float32(LENGTH), np.float32(WIDTH)
     across = np.abs(y - np.round(y / width) * width)
     along = x - np.floor(x / length) * length

@@ -26,12 +26,12 @@ ROOF_THICKNESS = 0.16
 
 @dataclass(frozen=True)
 class Plot:
-    """Where a house stands.
+    """The place where a house stands.
 
     Attributes:
         x, y: The middle, metres.
         width, depth: The extent along the street, and across it.
-        front: +1 where the street is at smaller y, -1 where it is at larger y.
+        front: The side of the street: +1 if it is at smaller y, -1 if it is at larger y.
         yaw: The direction, radians.
     """
 
@@ -69,18 +69,15 @@ def house(rng: np.random.Generator, plot: Plot) -> list[Solid]:
 def faces(
     rng: np.random.Generator, colour: Colour, level: Colour | None = None
 ) -> Callable[[Array], Finish]:
-    """The finish of a solid's faces by their normals, each with a texture of its own.
-
-    Args:
-        level: The colour of the faces that look up or down; None: the same.
-    """
+    """The finish of a solid's faces by their normals, each with a texture of its own. ``level`` is
+    the colour of the faces that look up or down; None is ``colour``."""
     return lambda normal: Finish(
         fresh(rng), level if level is not None and abs(normal[2]) > 0.2 else colour
     )
 
 
 def axes(yaw: float) -> tuple[Array, Array]:
-    """Horizontal unit vectors along and across a house."""
+    """The horizontal unit vectors along and across a house."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
 

@@ -33,7 +33,7 @@ class Town:
     Attributes:
         cells: The cells, in the order of the photographs.
         solids: The houses, trees, cars and all else that stands on the ground.
-        paved: (K, 2) corners of convex polygons: paths, drives and squares.
+        paved: The (K, 2) corners of convex polygons: paths, drives and squares.
     """
 
     cells: tuple[Cell, ...]
@@ -79,7 +79,7 @@ def _random(seed: int, part: int, cell: Cell) -> np.random.Generator:
 
 
 def _around(cells: tuple[Cell, ...]) -> list[Cell]:
-    """Cells that touch those of the town from outside."""
+    """The cells that touch those of the town from outside."""
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     return sorted({(x + i, y + j) for x, y in cells for i, j in steps} - set(cells))
 
@@ -114,7 +114,7 @@ class _Lot:
     Attributes:
         left, width: The extent along x.
         street: The y of the street's middle.
-        front: +1 on the side of larger y, else -1.
+        front: The side of the street: +1 at larger y, -1 at smaller y.
     """
 
     left: float
@@ -127,7 +127,7 @@ class _Lot:
         return self.left + self.width / 2
 
     def deep(self, distance: float) -> float:
-        """y at a distance from the street's middle."""
+        """The y at a distance from the street's middle."""
         return self.street + self.front * distance
 
 
@@ -172,8 +172,8 @@ def _plot(rng: np.random.Generator, lot: _Lot, site: _Site) -> None:
 
 
 def _enclose(rng: np.random.Generator, lot: _Lot, gate: float, back: float, site: _Site) -> None:
-    """Hedges, fences and walls around a plot; ``back``: the distance of the house's rear from the
-    street's middle."""
+    """Place hedges, fences and walls around a plot; ``back`` is the distance of the house's rear
+    from the street's middle."""
     right = lot.left + lot.width
     for a, b in ((lot.left + 0.1, gate - 0.75), (gate + 0.75, right - 0.1)):
         if b - a > 0.6 and rng.random() < 0.8:

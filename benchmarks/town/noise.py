@@ -12,18 +12,15 @@ Floats = NDArray[np.float32]
 
 TILE = 1024  # side of the periodic tile, texels
 TILE_SEED = 20
-# Standard deviation of the tile's channels, of 127 steps on either side of the mean.
+# The standard deviation of the tile's channels, of 127 steps on either side of the mean.
 TILE_SIGMA = 40.0
 
 
 def fractal(
     rng: np.random.Generator, height: int, width: int, finest: float, coarsest: float
 ) -> Floats:
-    """(height, width) sum of octaves of smooth noise, of about zero mean and unit deviation.
-
-    Args:
-        finest, coarsest: The shortest and longest distance between the noise's nodes, texels.
-    """
+    """A sum of octaves of smooth noise, (height, width), of about zero mean and unit deviation.
+    ``finest`` and ``coarsest`` bound the distances between the noise's nodes, texels."""
     total = np.zeros((height, width), np.float32)
     variance, step = 0.0, coarsest
     while step >= finest:
@@ -31,7 +28,7 @@ def fractal(
         rows, columns = int(height / step) + 3, int(width / step) + 3
         nodes = rng.standard_normal((rows, columns), dtype=np.float32)
         if step > 1:
-            # Cropped at a random phase: the nodes of all octaves must not coincide.
+            # A random crop shifts the phase: the nodes of all octaves must not coincide.
             large = cv2.resize(
                 nodes,
                 (int(columns * step), int(rows * step)),
@@ -47,11 +44,11 @@ def fractal(
 
 @cache
 def periodic_tile() -> NDArray[np.uint8]:
-    """(TILE, TILE, 4) independent periodic fields around 128 with a spectrum like that of natural
-    surfaces; computed once per process."""
+    """Four independent periodic fields around 128, (TILE, TILE, 4), with a spectrum like that of
+    natural surfaces; computed once per process."""
     rng = np.random.default_rng(TILE_SEED)
     frequency = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None])
-    # Detail down to three texels, structure up to a twelfth of the tile: repetitions do not show.
+    # Detail goes down to three texels, structure up to a twelfth of the tile: no repetition shows.
     band = (frequency > 12 / TILE) * np.exp(-((frequency * 2.5) ** 4))
     weight = band / np.maximum(frequency, 1 / TILE) ** 0.9
     fields = []

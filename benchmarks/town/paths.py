@@ -70,8 +70,8 @@ def _flight() -> list[tuple[Array, Array]]:
     for number, (middle, tilt) in enumerate(STRIPS):
         lean = np.tan(np.radians(tilt))
         along = (np.arange(SHOTS) + 0.5) * LENGTH / SHOTS
-        # From the far end to the near one and back, so that the last strip ends where the walk
-        # begins.
+        # A strip runs from the far end to the near one, and the next one back, so that the last
+        # ends where the walk begins.
         for x in along[::-1] if number % 2 == 0 else along:
             centre = np.array([x, middle - ALTITUDE * lean, ALTITUDE])
             shots.append((centre, _tilted(tilt)))
@@ -80,7 +80,7 @@ def _flight() -> list[tuple[Array, Array]]:
 
 
 def _tilted(degrees: float) -> Array:
-    """Rotation of a camera that looks down, tilted towards +y, with +x to the right."""
+    """The rotation of a camera that looks down, tilted towards +y, with +x to the right."""
     angle = np.radians(degrees)
     forward, right = np.array([0.0, np.sin(angle), -np.cos(angle)]), np.array([1.0, 0.0, 0.0])
     return np.stack([right, np.cross(forward, right), forward])

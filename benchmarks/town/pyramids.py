@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-# Longest run of samples that cv2.remap takes.
+# The longest run of samples that cv2.remap takes.
 MAX_SAMPLES = 32_000
 SMALLEST_LEVEL = 2  # texels
 
@@ -20,9 +20,9 @@ class Pyramid:
     """An image with its reductions by 2, 4, 8, ..., packed into one picture.
 
     Attributes:
-        packed: (H, W, K) uint8.
-        left, top: (L,) corner of each level in ``packed``.
-        width, height: (L,) size of each level.
+        packed: The levels in one picture, (H, W, K) uint8.
+        left, top: The corner of each level in ``packed``, (L,).
+        width, height: The size of each level, (L,).
         periodic: Whether the image repeats. If so, each level ends with a copy of its first
             column and row.
     """
@@ -39,7 +39,7 @@ class Pyramid:
         return self.packed.nbytes
 
     def sample(self, x: Floats, y: Floats, level: Floats) -> Floats:
-        """(N, K) values at (N,) positions.
+        """The (N, K) values at (N,) positions.
 
         Args:
             x, y: The texels of level 0 from the image's corner; clamped unless ``periodic``.

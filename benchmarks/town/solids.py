@@ -24,10 +24,10 @@ class Face:
     """A face of a prism.
 
     Attributes:
-        normal: (3,) outward unit normal.
+        normal: The outward unit normal, (3,).
         offset: The number for which points of the plane satisfy normal . x = offset.
-        origin: (3,) top left corner of the texture, seen from outside.
-        right, down: (3,) unit vectors of the texture's axes.
+        origin: The top left corner of the texture, seen from outside, (3,).
+        right, down: The unit vectors of the texture's axes, (3,).
         width, height: The metres covered by the texture.
         finish: What is painted on it.
     """
@@ -47,8 +47,8 @@ class Prism:
     """A convex solid: the intersection of the half-spaces of its faces.
 
     Attributes:
-        faces: Its planes.
-        vertices: (V, 3).
+        faces: The faces that bound it.
+        vertices: The corners, (V, 3).
     """
 
     faces: tuple[Face, ...]
@@ -72,7 +72,7 @@ class Ellipsoid:
 
     @property
     def corners(self) -> Array:
-        """(8, 3) corners of the bounding box."""
+        """The corners of the bounding box, (8, 3)."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
         return np.asarray(np.array(self.centre) + signs * np.array(self.radii))
 

@@ -22,13 +22,13 @@ from pipeline.scene.reconstruction import PosedImage
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-# Memory for painted textures, of each process.
+# The memory for painted textures, of each process.
 TEXTURE_BYTES = 256 * 2**20
-# Exponent of the foreshortening in the width of the texture filter: 1 avoids all aliasing and blurs
-# along surfaces that are seen at a grazing angle, 0.5 is the mean of both directions.
+# The exponent of the foreshortening in the width of the texture filter: 1 avoids all aliasing and
+# blurs along surfaces that are seen at a grazing angle, 0.5 is the mean of both directions.
 FORESHORTENING = 0.75
 HORIZON, ZENITH = (0.72, 0.78, 0.84), (0.26, 0.42, 0.68)
-# Width of the filter in pixels: that of a Gaussian of sigma s is about 2 s.
+# The width of the filter in pixels: that of a Gaussian of sigma s is about 2 s.
 FILTER_PX = 2 * TEXTURE_SIGMA
 LEAF_TEXEL = 0.012
 
@@ -88,7 +88,7 @@ def capture(town: Town, camera: Camera, through: Rays) -> Capture:
 
 
 def photograph(town: Capture, posed: PosedImage) -> tuple[Array, Floats]:
-    """(H, W, 3) linear light, and (H, W) float32 depth (z) at pixel centres, 0 for the sky."""
+    """The linear light, (H, W, 3), and float32 depth (z) at pixel centres, (H, W); 0 is sky."""
     light = _light(town, posed, visible(town.shapes, posed, town.fine))
     inverse = visible(town.shapes, posed, town.centres).inverse
     depth = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
@@ -96,7 +96,7 @@ def photograph(town: Capture, posed: PosedImage) -> tuple[Array, Floats]:
 
 
 def _light(town: Capture, posed: PosedImage, hits: Hits) -> Floats:
-    """(R, C, 3) linear light of the fine rays."""
+    """The linear light of the fine rays, (R, C, 3)."""
     light = np.empty((hits.label.size, 3), np.float32)
     labels = hits.label.ravel()
     order = np.argsort(labels, kind="stable")
@@ -122,11 +122,8 @@ def _light(town: Capture, posed: PosedImage, hits: Hits) -> Floats:
 
 @dataclass(frozen=True)
 class _Hit:
-    """Hits of rays: (N,) ``x`` and ``y`` of the ray in the camera's frame, and inverse depths.
-
-    Attributes:
-        pixel: The width of the texture filter at unit depth.
-    """
+    """Hits of rays: (N,) ``x`` and ``y`` of the ray in the camera's frame, and inverse depths;
+    ``pixel`` is the width of the texture filter at unit depth."""
 
     posed: PosedImage
     x: Floats
@@ -135,17 +132,17 @@ class _Hit:
     pixel: float
 
     def along(self, axis: Array) -> Floats:
-        """(N,) component of the unnormalised rays along a vector of the world."""
+        """The component of the unnormalised rays along a vector of the world, (N,)."""
         a, b, c = (np.float32((axis * row).sum()) for row in self.posed.rotation)
         return np.asarray(a * self.x + b * self.y + c)
 
     def position(self, axis: Array, origin: Array) -> Floats:
-        """(N,) coordinate of the hits along a vector, from an origin."""
+        """The coordinate of the hits along a vector, from an origin, (N,)."""
         start = np.float32(((self.posed.centre - origin) * axis).sum())
         return np.asarray(start + self.along(axis) / self.inverse)
 
     def blur(self, normal: Array) -> Floats:
-        """(N,) width of the texture filter on a plane, metres."""
+        """The width of the texture filter on a plane, (N,), metres."""
         steep = np.abs(self.along(normal)) / np.sqrt(1 + self.x**2 + self.y**2)
         wide = np.maximum(steep, np.float32(0.01)) ** np.float32(FORESHORTENING)
         return np.asarray(np.float32(self.pixel) / (self.inverse * wide))
@@ -166,7 +163,7 @@ def _ground(ground: Ground, rays: _Hit) -> Floats:
 
 
 def _irradiance(normal: Array) -> Floats:
-    """(3,) light on an unshadowed plane."""
+    """The light on an unshadowed plane, (3,)."""
     direct = np.float32(max(0.0, float((normal * SUN).sum())))
     open_share = np.float32(0.72 + 0.28 * normal[2])
     return SUNLIGHT * direct + SKYLIGHT * open_share

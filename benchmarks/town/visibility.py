@@ -21,12 +21,12 @@ from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
 
-# Depth at which solids around the camera are cut, metres.
+# The depth at which solids around the camera are cut, metres.
 NEAR = 0.05
-# Depth at which the ground ends.
+# The depth at which the ground ends, metres.
 FAR = 700.0
 SKY, GROUND = 0, 1
-# Rays compared at once: the arrays stay in the cache.
+# The number of rays compared at once, whose arrays stay in the cache.
 BATCH = 65_536
 
 
@@ -35,7 +35,7 @@ class Grid:
     """Rays of unit depth through a raster of points on the image.
 
     Attributes:
-        x, y: (R, C) first two components in the camera's frame; the third is 1. They increase
+        x, y: The first two components in the camera's frame, (R, C); the third is 1. They increase
             along the rows and columns, as those of any lens without folds.
     """
 
@@ -51,8 +51,8 @@ class Grid:
         return self.y.min(1), self.y.max(1)
 
     def window(self, low: Array, high: Array) -> tuple[int, int, int, int]:
-        """Rows [r0, r1) and columns [c0, c1) that hold all rays with ``low`` <= (x, y) <= ``high``;
-        empty where there are none."""
+        """The rows [r0, r1) and columns [c0, c1) that hold all rays with ``low`` <= (x, y) <=
+        ``high``; empty if there are none."""
         left, right = self._columns
         top, bottom = self._rows
         c0, c1 = np.searchsorted(right, low[0]), np.searchsorted(left, high[0], "right")
@@ -62,11 +62,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of the rays of a grid.
+    """The first hits of the rays of a grid.
 
     Attributes:
-        inverse: (R, C) inverse depth; 0 where there is nothing but sky.
-        label: (R, C) SKY, GROUND, or 2 and more: the index + 2 into ``seen``.
+        inverse: The inverse depths, (R, C); 0 where there is nothing but sky.
+        label: The labels, (R, C): SKY, GROUND, or the index into ``seen`` plus 2.
         seen: The solids, and the face of each (0 of ellipsoids).
         tests: The number of pairs of a ray and a solid that were compared.
     """
@@ -83,7 +83,7 @@ class Shapes:
 
     Attributes:
         solids: The solids, in any order.
-        corners: (S, V, 3), short lists filled with their last corner.
+        corners: The corners, (S, V, 3); short lists are filled with their last corner.
     """
 
     solids: tuple[Solid, ...]
@@ -102,7 +102,7 @@ def visible(shapes: Shapes, posed: PosedImage, grid: Grid) -> Hits:
     the grid."""
     inverse = np.zeros_like(grid.x)
     order, low, high, nearest = _candidates(shapes, posed, grid)
-    # 16 bits are sorted faster. A solid has at most as many faces as corners, here.
+    # 16 bits are sorted faster. The solids here have at most as many faces as corners.
     most = len(order) * shapes.corners.shape[1]
     label = np.zeros(grid.x.shape, np.uint16 if most < 65_000 else np.uint32)
     _ground(posed, grid, inverse, label)
@@ -129,8 +129,8 @@ def visible(shapes: Shapes, posed: PosedImage, grid: Grid) -> Hits:
 def _candidates(
     shapes: Shapes, posed: PosedImage, grid: Grid
 ) -> tuple[NDArray[np.intp], Array, Array, Array]:
-    """Solids in front of the camera whose projections meet the image, nearest first; and of all
-    solids the bounds of the projection (S, 2) and the largest inverse depth (S,)."""
+    """The solids in front of the camera whose projections meet the image, nearest first; and of all
+    solids the bounds of the projection, (S, 2), and the largest inverse depth, (S,)."""
     offset = shapes.corners - posed.centre
     # Avoid a matrix product: BLAS may round differently with the number of threads.
     local = [(offset * row).sum(-1) for row in posed.rotation]
@@ -150,8 +150,8 @@ def _candidates(
 
 
 def _cut(corners: Array) -> tuple[Array, Array]:
-    """Bounds of the projection of the part of a convex solid beyond NEAR, from its corners in the
-    camera's frame: those beyond, and where the lines between corners cross NEAR."""
+    """The bounds of the projection of the part of a convex solid beyond NEAR, from its corners in
+    the camera's frame: those beyond, and where the lines between corners cross NEAR."""
     beyond = corners[corners[:, 2] > NEAR]
     before = corners[corners[:, 2] <= NEAR]
     share = (NEAR - before[:, None, 2]) / (beyond[None, :, 2] - before[:, None, 2])
@@ -184,9 +184,9 @@ class _Planes:
     """A prism seen from a camera: inverse depths of its faces as weights of (x, y, 1).
 
     Attributes:
-        outside: (F, 3) weights of the faces that the camera is outside of; ``faces`` has their
-            indices.
-        inside: (G, 3) weights of the other faces.
+        outside: The weights of the faces that the camera is outside of, (F, 3).
+        inside: The weights of the other faces, (G, 3).
+        faces: The indices of the faces of ``outside``.
     """
 
     outside: Array
@@ -200,7 +200,7 @@ class _Planes:
             other = _linear(weights, x, y)
             which[other < enter] = i
             np.minimum(enter, other, out=enter)
-        leave = inverse.copy()  # not less than 0: solids behind the camera are not seen
+        leave = inverse.copy()  # It is not less than 0, so solids behind the camera are not seen.
         for weights in self.inside:
             np.maximum(leave, _linear(weights, x, y), out=leave)
         hit = enter > leave
@@ -224,8 +224,8 @@ class _Quadric:
     """An ellipsoid seen from a camera, in a frame where it is the unit sphere.
 
     Attributes:
-        axes: (3, 3) the components of a ray in that frame as weights of (x, y, 1).
-        towards: (3,) minus the product of the camera's position with a ray, as weights.
+        axes: The components of a ray in that frame as weights of (x, y, 1), (3, 3).
+        towards: The negative product of the camera's position with a ray, as weights, (3,).
         gap: The squared distance of the camera from the centre, minus 1.
     """
 

@@ -37,7 +37,7 @@ from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 Order = Literal["sequence", "scattered"]
 
-# Limits of the memory for the town's solids, and for the rays of a photograph.
+# Limits that bound the memory for the town's solids, and for the rays of a photograph.
 MAX_PHOTOGRAPHS = 20_000
 MIN_SIDE, MAX_SIDE = 16, 4096  # pixels
 START = datetime(2026, 1, 1, 8)
@@ -49,7 +49,7 @@ LENS_CHOICES = tuple(name for name in LENSES if name not in WIDE and "fisheye" n
 
 @dataclass(frozen=True)
 class TownSpec:
-    """Options of the town.
+    """The options of the town.
 
     Attributes:
         photographs: The number of photographs, to which the town's area is proportional.

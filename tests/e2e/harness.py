@@ -20,9 +20,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 SOURCES = ("Snakefile", "pipeline", "stages", "profiles", "pyproject.toml")
 
-# Views 12 degrees apart: fewer overlap, and the test views still lie between others.
+# The views are 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
-# Small enough for a full run in well under a minute, large enough to go through densification.
+# The run is short enough to take well under a minute, and goes through densification.
 TINY = {
     "views": {"max_long_side_px": 200},
     "train": {"steps": 240, "density": {"max_gaussians": 6_000}},
@@ -61,7 +61,7 @@ def copy_run(source: Path, target: Path) -> Path:
 def environment(project: Path) -> dict[str, str]:
     return os.environ | {
         "PYTHONPATH": str(project),
-        # The compiled extension of the project under test: same sources, same key.
+        # The compiled extension is that of the project under test: its key follows its sources.
         "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "native")),
         "NO_COLOR": "1",
         # LPIPS weights of this machine would change what is expected.
@@ -115,7 +115,7 @@ def snakemake(
 
 
 def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
-    """Names of the rules of which jobs were started, for one scene or for all."""
+    """The names of the rules whose jobs were started, for one scene or for all."""
     if scene is None:
         return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
     jobs = re.findall(
@@ -154,12 +154,12 @@ def start_and_kill(
 
 
 def metrics(project: Path, scene: str) -> dict:
-    """``metrics.json``: the same for the same work."""
+    """The contents of ``metrics.json``, which are the same for the same work."""
     return json.loads((project / "results" / scene / "metrics.json").read_text())
 
 
 def model_digests(project: Path, scene: str) -> dict[str, str]:
-    """Digest of every file that makes up the result."""
+    """The digest of every file that makes up the result."""
     folder = project / "results" / scene
     files = [
         *(folder / "export").rglob("*"),

@@ -71,7 +71,7 @@ def counts(value: bytes, at: int) -> Bomb:
 
 
 def packed_counts(value: bytes, at: int) -> Bomb:
-    """Likewise, in the unpacked content."""
+    """An integer in the unpacked content, where counts and sizes are."""
 
     def make(reader: Reader, data: bytes) -> bytes:
         return reader.pack(counts(value, at)(reader, reader.unpack(data)))

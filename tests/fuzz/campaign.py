@@ -50,9 +50,9 @@ class Outcome:
     """The result of a campaign.
 
     Attributes:
-        cases: number of cases that were run.
-        read: number of those that the reader accepted; the others raised a ``UserError``.
-        findings: what was raised and where -> number of the first case that raised it.
+        cases: The number of cases that were run.
+        read: The number of those that the reader accepted; the others raised a ``UserError``.
+        findings: What was raised and where -> the number of the first case that raised it.
     """
 
     cases: int = 0
@@ -87,7 +87,7 @@ def run(name: str, cases: range, progress: Path | None = None) -> Outcome:
     """Run cases in this process, whose memory is limited meanwhile.
 
     Args:
-        progress: file that holds the number of the present case, for the process that watches.
+        progress: The file that holds the number of the present case, for the process that watches.
     """
     reader = READERS[name]
     seeds = list(reader.seeds())
@@ -178,7 +178,7 @@ def judged(
     """What ``_judge`` reports about each case, under the limits, in this process.
 
     Args:
-        cases: name -> the files; None for those that ``folder`` has.
+        cases: A name -> its files, or None for those that ``folder`` has.
     """
     found = {}
     with _limits():

@@ -104,7 +104,7 @@ def look(folder: Path) -> object:
 
 
 def _remove(path: Path) -> None:
-    """Remove a folder; names of bytes that are not UTF-8 included."""
+    """Remove a folder, including names of bytes that are not UTF-8."""
     if not path.exists():
         return
     for entry in os.scandir(os.fsencode(path)):

@@ -57,7 +57,7 @@ def tiff(pixels: np.ndarray, **options: object) -> bytes:
 
 
 def pack_checked(data: bytes) -> bytes:
-    """PNG chunks and archives of numpy get correct checksums; other files are as they are."""
+    """Give PNG chunks and archives of numpy correct checksums; other files stay as they are."""
     return pack_png(data) if data[1:4] == b"PNG" else data
 
 
@@ -163,7 +163,7 @@ def profile_of(picture: bytes) -> bytes:
 
 def coloured_seeds() -> Sequence[Files]:
     found: list[Files] = [{"x.png": with_profile(profile)} for profile in profiles()]
-    # PNG's own chunks: primaries, gamma, code points.
+    # These are PNG's own chunks: primaries, gamma, code points.
     plain = encoded(np.full((HEIGHT, WIDTH, 3), 99, np.uint8), ".png")
     chunks = {
         b"gAMA": struct.pack(">I", 55556),

@@ -100,7 +100,7 @@ SEEDS: dict[PoseKind, Callable[[], Sequence[Files]]] = {
 
 
 def read_poses(kind: PoseKind) -> Callable[[Path], object]:
-    """Finds the file and reads the poses of all photographs that it lists."""
+    """A reader that finds the file and reads the poses of all photographs that it lists."""
 
     def read(folder: Path) -> object:
         entry = format_of(kind)

@@ -18,11 +18,11 @@ class Reader:
     """A reader under test.
 
     Attributes:
-        seeds: the names and contents of one valid set of files each; the first file is mutated.
-        read: reads the folder of the files; raises what the oracle judges.
-        unpack, pack: half of the cases mutate ``unpack(content)``, and the file is ``pack`` of it:
+        seeds: The names and contents of one valid set of files each; the first file is mutated.
+        read: The function that reads the folder of the files; it raises what the oracle judges.
+        unpack, pack: Half of the cases mutate ``unpack(content)``, and the file is ``pack`` of it:
             for formats with checksums and compression, which refuse most other mutations.
-        weight: share of a campaign's cases, relative to the others.
+        weight: The share of a campaign's cases, relative to the others.
     """
 
     seeds: Callable[[], Sequence[Files]]

@@ -183,7 +183,7 @@ def photo_seeds(suffix: str) -> Callable[[], Sequence[Files]]:
 
 
 def read_photo(folder: Path) -> object:
-    """The facts, then the pixels, as the stages read them."""
+    """Read the facts, then the pixels, as the stages do."""
     (file,) = folder.iterdir()
     facts = read_facts(file)
     assert facts.width > 0 and facts.height > 0 and facts.body.isprintable()
@@ -206,7 +206,7 @@ def exr_seeds() -> Sequence[Files]:
 
 
 def read_exr(file: Path) -> object:
-    """The facts, then the pixels, whose ValueError the check of photographs reports."""
+    """Read the facts, then the pixels, whose ValueError the check of photographs reports."""
     read_facts(file)
     try:
         return exr.read_pixels(io.BytesIO(file.read_bytes()))

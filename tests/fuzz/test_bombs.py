@@ -11,7 +11,7 @@ from tests.fuzz.readers import READERS
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_bomb_ends_with_one_error(name, tmp_path):
-    """Or is read, within the limits of time and memory."""
+    """It may be read, too, within the limits of time and memory."""
     reader = READERS[name]
     seeds = list(reader.seeds())
     if not seeds:

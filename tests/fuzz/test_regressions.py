@@ -44,7 +44,7 @@ def npy(header: str) -> bytes:
     ],
 )
 def test_headers_of_numpy_are_python_source(header):
-    """numpy's parser raised tokenize.TokenError, which is no ValueError."""
+    """numpy's parser raises tokenize.TokenError, which is no ValueError."""
     with pytest.raises(ValueError, match="expected"):
         read_array(npy(header))
 
@@ -68,7 +68,7 @@ def test_a_ply_header_with_a_count_of_5000_digits(tmp_path):
 
 
 def test_a_truncated_heic_picture(tmp_path):
-    """pillow-heif raised EOFError."""
+    """pillow-heif raises EOFError."""
     reader = READERS["heic"]
     seeds = list(reader.seeds())
     if not seeds:
@@ -113,7 +113,7 @@ def test_a_mask_in_a_folder_whose_name_is_not_utf8(tmp_path) -> None:
 
 @pytest.mark.parametrize("height", [21, 3000, 16_744_448])
 def test_a_picture_that_lacks_strips(height, tmp_path) -> None:
-    """Pillow took missing strips for black: 5 GB of them from a file of 1690 bytes."""
+    """Pillow takes missing strips for black: 5 GB of them from a file of 1690 bytes."""
     data = bytearray(tiff(noise(4), photometric="rgb", rowsperstrip=4))
     entry = data.index(struct.pack("<H", 257))
     data[entry + 2 : entry + 12] = struct.pack("<HII", 4, 1, height)
@@ -134,7 +134,7 @@ def test_a_bitmap_that_claims_to_be_large(height, tmp_path) -> None:
 
 
 def test_a_name_of_many_digits(tmp_path) -> None:
-    """The message had 2048 characters."""
+    """The message stays short, however long the name is."""
     reader = READERS["colmap-images.bin"]
     for name, data in content("colmap-images.bin", reader, list(reader.seeds()), 1102849).items():
         (tmp_path / name).write_bytes(data)
@@ -146,7 +146,7 @@ def test_a_name_of_many_digits(tmp_path) -> None:
 @pytest.mark.parametrize("read", [read_picture, read_mask])
 @pytest.mark.parametrize("height", [20, 16_776_976])
 def test_a_png_with_fewer_rows_than_its_header_says(read, height, tmp_path) -> None:
-    """Pillow took the missing rows for black."""
+    """Pillow takes the missing rows for black."""
     data = bytearray(encoded(noise(1), ".png"))
     data[20:24] = height.to_bytes(4, "big")
     file = tmp_path / "x.png"

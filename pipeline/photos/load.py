@@ -22,6 +22,7 @@ from pipeline.io.names import suffix_of
 from pipeline.io.pictures import decode_depth, decode_mask, decode_photograph
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import shortened
 from pipeline.scene.views import Crop, View
 
 Picture = NDArray[Any]
@@ -112,11 +113,12 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
             depth = next(iter(read_archive(io.BytesIO(data)).values()), None)
         else:
             depth = decode_depth(data)
-    except ValueError:
-        depth = None
+        reason = ""
+    except ValueError as error:
+        depth, reason = None, f": {shortened(str(error))}"
     if depth is None:
         raise UserError(
-            "the depth map cannot be read",
+            f"the depth map cannot be read{reason}",
             file=path,
             fix="Save it as 16-bit grey PNG, float TIFF or .npy.",
         )

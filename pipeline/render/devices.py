@@ -95,7 +95,7 @@ def _times_of(adapter: Adapter) -> tuple[float, float] | str:
         pass
     times: tuple[float, float] | str
     try:
-        # In a process of its own, since drivers crash.
+        # The steps are timed in a process of their own, since drivers crash.
         times = run_isolated(time_steps, f"gpu:{adapter.number}")
     except UserError as error:
         times = error.what

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.ply import read_splat_ply
-from pipeline.photos.load import read_mask, read_picture
+from pipeline.photos.load import read_depth, read_mask, read_picture
 from pipeline.runtime.errors import UserError
 from tests.fuzz.campaign import content, judged
 from tests.fuzz.clouds import las_seeds, read_las_points
@@ -162,3 +162,5 @@ def test_a_depth_map_with_a_chunk_that_claims_a_gigabyte(tmp_path) -> None:
     data[chunk - 4 : chunk] = struct.pack(">I", 1 << 30)
     case = {"chunk": {"d.png": bytes(data)}}
     assert judged(READERS["depth"], case, tmp_path / "files") == {"chunk": ""}
+    with pytest.raises(UserError, match="cannot be read: the image is truncated or damaged"):
+        read_depth(tmp_path / "files" / "d.png")

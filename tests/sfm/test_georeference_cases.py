@@ -104,7 +104,7 @@ def test_any_projection_and_either_order(
     seed: int, count: int, code: str | None, swap: bool
 ) -> None:
     """The other order is refused or warned of: a triangle is congruent to its mirror image, so only
-    the orientation of the photographs contradicts three points in the other order."""
+    the orientation of the photographs contradicts three points, or three of a few more."""
     header = code or "EPSG:4326"
     order = [1, 0, 2] if swap else [0, 1, 2]
     case = by_control(count, header=header, code=code, change=lambda rows: rows[:, order])

@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.command.main import WORKFLOW_COMMANDS, make_parser
+from pipeline.command.main import make_parser
+from pipeline.command.parser import Parser
 from pipeline.config.docs import ROOT, SCHEMAS, write_pages
 
 REFERENCE = ROOT / "docs" / "reference"
@@ -103,13 +104,10 @@ def command_line() -> str:
     parser = make_parser()
     lines = [_INTRO]
     for name, help_text, command in _commands(parser):
-        positional = [a for a in command._actions if not a.option_strings]
-        usage = " ".join([parser.prog, name, *(str(_metavar(a)) for a in positional), "[OPTIONS]"])
         about = command.description or f"{help_text[:1].upper()}{help_text[1:]}."
         lines += [f"## {name}", "", about, ""]
-        lines += [f"    {usage}", ""]
-        if name in WORKFLOW_COMMANDS:
-            lines += ["Further options are Snakemake's.", ""]
+        example = (command.epilog or "").rpartition("\n")[2].strip()
+        lines += [f"    {command.short_usage()}", f"    {example}", ""]
         rows = [_row(action) for action in command._actions if action.dest != "help"]
         if rows:
             lines += ["| argument | meaning |", "|---|---|", *rows, ""]
@@ -117,8 +115,8 @@ def command_line() -> str:
 
 
 def _commands(
-    parser: argparse.ArgumentParser,
-) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
+    parser: Parser,
+) -> Iterator[tuple[str, str, Parser]]:
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             helps = {choice.dest: choice.help or "" for choice in action._choices_actions}

@@ -8,12 +8,14 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from pipeline.config.names import hint
 from pipeline.config.options import sections_of
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import is_config_name
 from pipeline.config.schema import Config
 from pipeline.config.section import FilePath, Seed
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.text import shortened, shown
 
 # The quotation marks around a text that ``shown`` quotes.
@@ -132,7 +134,7 @@ def _validated(model: type[Any], raw: Mapping[str, Any], prefix: str) -> Any:
         lines = _error_lines(model, error, prefix)
         raise UserError(
             "the configuration is not valid:\n  " + "\n  ".join(lines),
-            fix=f"see {' and '.join(REFERENCE)} for every option",
+            fix=f"{COMMAND} options lists all options and explains those that it is given",
         ) from None
 
 
@@ -142,9 +144,10 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
     wrong: dict[str, tuple[list[str], str]] = {}
     lines: list[str] = []
     for problem in problems[:_MAX_ERRORS]:
-        path, sections = _path(model, problem["loc"])
+        path = _path(model, problem["loc"])
         if problem["type"] == "extra_forbidden":
-            lines.append(f"{path}: no such option{_nearest(sections, path)}")
+            meant = hint(model, path, problem["input"], str(problem["loc"][-1]))
+            lines.append(f"{path}: no such option{meant}")
             continue
         expected, _ = wrong.setdefault(path, ([], shown(problem["input"])))
         expected.append(shortened(problem["msg"].removeprefix("Value error, "), _MAX_MESSAGE))
@@ -158,8 +161,8 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
     return lines
 
 
-def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> tuple[str, tuple[type[BaseModel], ...]]:
-    """The dotted path of an error's location, and the sections that its last part belongs to.
+def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+    """The dotted path of an error's location.
 
     pydantic adds the strategy's name to locations in ``train.density``, and the kind of a value to
     those of an option that allows several kinds; a path has none of them.
@@ -180,13 +183,4 @@ def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> tuple[str, tuple[type
             inner = sections_of(fields[0])
             leaf = not inner
             sections, alternatives = inner, len(inner) > 1
-    return ".".join(names), sections
-
-
-def _nearest(sections: tuple[type[BaseModel], ...], path: str) -> str:
-    """A hint at the option that was probably meant."""
-    from difflib import get_close_matches
-
-    names = [name for section in sections for name in section.model_fields]
-    close = get_close_matches(path.rsplit(".", 1)[-1], names, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
+    return ".".join(names)

@@ -1,0 +1,41 @@
+"""Targets that no rule makes: the message names the one that was probably meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stages.workflow.targets import unknown_target
+
+MEANT = {
+    "results/door": "results/door/metrics.json",
+    "results/door/metric.json": "results/door/metrics.json",
+    "results/door/metricsjson": "results/door/metrics.json",
+    "results/door/reprot.html": "results/door/report.html",
+    "results/door/trian/stage.json": "results/door/train/stage.json",
+    "results/dor/metrics.json": "results/door/metrics.json",
+    "results/dor@fast@seed1/metrics.json": "results/door@fast@seed1/metrics.json",
+    "results/dor": "results/door/metrics.json",
+    "result/door/metrics.json": "results/door/metrics.json",
+    "door": "results/door/metrics.json",
+    "data/door/": "results/door/metrics.json",
+    "dor": "results/door/metrics.json",
+    "al": "all",
+    "results/benchmark.cvs": "results/benchmark.csv",
+    "benchmark.csv": "results/benchmark.csv",
+    "results/indx.html": "results/index.html",
+}
+
+
+@pytest.mark.parametrize("target", MEANT)
+def test_the_target_that_was_meant_is_named(target: str) -> None:
+    error = str(unknown_target(target, Path("photos"), ["door", "garden"]))
+    assert f"(did you mean {MEANT[target]}?)" in error
+    assert error.startswith(f"{target}: ") and "results/benchmark.csv" in error
+
+
+def test_a_scene_that_is_not_there_is_looked_for_in_data_root() -> None:
+    error = str(unknown_target("results/kitchen/metrics.json", Path("photos"), ["door"]))
+    assert "there is no scene 'kitchen' in photos" in error and "did you mean" not in error
+    assert "did you mean" not in str(unknown_target("", Path("photos"), []))

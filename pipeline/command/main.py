@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.command import parser as types
 from pipeline.command.parser import Parser
-from pipeline.config.presets import PRESETS
+from pipeline.command.workflow import add_workflow_commands
 from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.suggest import check_exists
 
 if TYPE_CHECKING:
-    from pipeline.command.workflow import Running
     from pipeline.commands import Rendering
 
 MODEL = "file of Gaussians (.ply, .spz, .splat, .glb, or .npz of the results)"
@@ -110,7 +109,7 @@ def make_parser(program: str = "splatmake") -> Parser:
         sub.set_defaults(command=run, parser=sub)
         return sub.add_argument
 
-    _add_workflow_commands(command)
+    add_workflow_commands(command)
     text = "show a scene in the browser, also during training"
     about = (
         "Show a scene in the browser. During training, the newest checkpoint is shown and "
@@ -118,7 +117,7 @@ def make_parser(program: str = "splatmake") -> Parser:
     )
     _add_view(command("view", _view, text, "results/garden", about))
     text = "convert Gaussians to another format, optionally with fewer coefficients"
-    example = "results/garden/export/point_cloud.ply garden.spz --min-opacity 0.02"
+    example = "point_cloud.ply garden.spz --min-opacity 0.02"
     _add_convert(command("convert", _convert, text, example))
     example = "garden.spz --cameras results/garden -o renders"
     _add_render(command("render", _render, "render Gaussians from given cameras, to PNG", example))
@@ -131,7 +130,7 @@ def make_parser(program: str = "splatmake") -> Parser:
         "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
         "differences between two batches of the same runs."
     )
-    _add_compare(command("compare", _compare, text, "results --base balanced", about))
+    _add_compare(command("compare", _compare, text, "results --base fast", about))
     text = "write training curves for TensorBoard"
     _add_tensorboard(command("tensorboard", _tensorboard, text, "results -o curves --follow"))
     text = "list the options of --config and explain them"
@@ -153,89 +152,6 @@ def make_parser(program: str = "splatmake") -> Parser:
 
 # Each command is a function that adds its arguments, and the function that runs it. Commands import
 # what they need, so that --help and wrong options do not import torch.
-
-
-def _add_workflow_commands(command: Callable[..., Callable[..., object]]) -> None:
-    about = (
-        "{}. Results are in results/{}. Further options are Snakemake's (-n: "
-        "plan only); options of the reconstruction are given with --config."
-    )
-    text = "reconstruct a scene from a folder of photographs"
-    example = "photos/garden --preset fast --config train.steps=2000"
-    add = command("run", _run, text, example, about.format(text.capitalize(), "NAME/"))
-    _add_scene(add)
-    text = "show what run would do, with reasons, and do nothing"
-    add = command("plan", _plan, text, "photos/garden")
-    _add_scene(add)
-    text = "reconstruct all scenes in a folder, and compare configurations"
-    example = "photos --configs fast,balanced --seeds 0,1,2"
-    results = "SCENE/ and compared in results/index.html"
-    add = command("batch", _batch, text, example, about.format(text.capitalize(), results))
-    add("folder", type=Path, metavar="FOLDER", help="has a folder of photographs for each scene")
-    text = "presets to compare, separated by commas (default: the configuration file's configs)"
-    add("--configs", type=types.listed, default=[], metavar="PRESETS", help=text)
-    text = "repeat each run with these seeds, separated by commas"
-    add("--seeds", type=types.seeds, default=[], metavar="SEEDS", help=text)
-    _add_running(add)
-
-
-def _add_scene(add: Callable[..., object]) -> None:
-    add("folder", type=Path, metavar="FOLDER", help="the scene's photographs")
-    text = "the scene's name in the results (default: the folder's)"
-    add("--name", metavar="NAME", help=text)
-    _add_running(add)
-
-
-def _add_running(add: Callable[..., object]) -> None:
-    text = (
-        "folder to run in, which holds results/ and, if wanted, config/config.yaml (default: the "
-        "current folder)"
-    )
-    add("--out", type=Path, metavar="DIR", help=text)
-    add("--preset", choices=tuple(PRESETS), help="(default: the configuration file's)")
-    text = "processor cores to use (default: all)"
-    add("-c", "--cores", type=types.cores, default="all", metavar="N", help=text)
-    add(
-        *("-C", "--config"),
-        nargs="+",
-        type=types.entry,
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help="options of the reconstruction, such as train.steps=2000; the command options lists "
-        "them",
-    )
-    text = "Snakemake profile: a folder, or one of the program's: ci, slurm"
-    add("--workflow-profile", dest="profile", metavar="PROFILE", help=text)
-
-
-def _run(folder: Path, name: str | None, **options: Any) -> None:
-    from pipeline.command.workflow import replace_process, run_command
-
-    replace_process(run_command(folder, name, _running(options)))
-
-
-def _plan(options: list[str], **others: Any) -> None:
-    _run(options=["--dry-run", *options], **others)
-
-
-def _batch(folder: Path, configs: list[str], seeds: list[int], **options: Any) -> None:
-    from pipeline.command.workflow import batch_command, replace_process
-
-    replace_process(batch_command(folder, configs, seeds, _running(options)))
-
-
-def _running(options: dict[str, Any]) -> Running:
-    """The settings of ``_add_running``.
-
-    Raises:
-        UserError: An option is neither the command's nor Snakemake's.
-    """
-    from pipeline.command.passed_options import check_passed_options
-    from pipeline.command.workflow import Running
-
-    check_passed_options(options["options"], options.pop("parser"))
-    return Running(**options)
 
 
 def _add_convert(add: Callable[..., object]) -> None:

@@ -6,11 +6,13 @@ import importlib.util
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
+from pipeline.command import parser as types
+from pipeline.command.passed_options import check_passed_options
 from pipeline.config.config_file import check_config_file
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import name_fault
@@ -41,6 +43,95 @@ class Running:
     config: Sequence[str]
     profile: str | None
     options: Sequence[str]
+
+
+def add_workflow_commands(command: Callable[..., Callable[..., object]]) -> None:
+    """Add the commands, with their arguments, to the command line.
+
+    Args:
+        command: Adds a command and returns the ``add_argument`` of its parser.
+    """
+    about = (
+        "{}. Results are in results/{}. Further options are Snakemake's (-n: "
+        "plan only); options of the reconstruction are given with --config."
+    )
+    text = "reconstruct a scene from a folder of photographs"
+    example = "photos/garden --preset fast --config train.steps=2000"
+    add = command("run", _run, text, example, about.format(text.capitalize(), "NAME/"))
+    _add_scene(add)
+    text = "show what run would do, with reasons, and do nothing"
+    add = command("plan", _plan, text, "photos/garden")
+    _add_scene(add)
+    text = "reconstruct all scenes in a folder, and compare configurations"
+    example = "photos --configs fast,balanced --seeds 0,1,2"
+    results = "SCENE/ and compared in results/index.html"
+    add = command("batch", _batch, text, example, about.format(text.capitalize(), results))
+    add("folder", type=Path, metavar="FOLDER", help="has a folder of photographs for each scene")
+    text = "presets to compare, separated by commas (default: the configuration file's configs)"
+    add("--configs", type=types.listed, default=[], metavar="PRESETS", help=text)
+    text = "repeat each run with these seeds, separated by commas"
+    add("--seeds", type=types.seeds, default=[], metavar="SEEDS", help=text)
+    _add_running(add)
+
+
+def _add_scene(add: Callable[..., object]) -> None:
+    add("folder", type=Path, metavar="FOLDER", help="the scene's photographs")
+    text = "the scene's name in the results (default: the folder's)"
+    add("--name", metavar="NAME", help=text)
+    _add_running(add)
+
+
+def _add_running(add: Callable[..., object]) -> None:
+    text = (
+        "folder to run in, which holds results/ and, if wanted, config/config.yaml (default: the "
+        "current folder)"
+    )
+    add("--out", type=Path, metavar="DIR", help=text)
+    add("--preset", choices=tuple(PRESETS), help="(default: the configuration file's)")
+    text = "processor cores to use (default: all)"
+    add("-c", "--cores", type=types.cores, default="all", metavar="N", help=text)
+    add(
+        *("-C", "--config"),
+        nargs="+",
+        type=types.entry,
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="options of the reconstruction, such as train.steps=2000; the command options lists "
+        "them",
+    )
+    text = "Snakemake profile: a folder, or one of the program's: ci, slurm"
+    add("--workflow-profile", dest="profile", metavar="PROFILE", help=text)
+
+
+def _run(folder: Path, name: str | None, **options: Any) -> None:
+    how = _running(options)
+    _start(run_command(folder, name, how), how)
+
+
+def _plan(options: list[str], **others: Any) -> None:
+    _run(options=["--dry-run", *options], **others)
+
+
+def _batch(folder: Path, configs: list[str], seeds: list[int], **options: Any) -> None:
+    how = _running(options)
+    _start(batch_command(folder, configs, seeds, how), how)
+
+
+def _start(command: list[str], how: Running) -> None:
+    if how.out is not None:
+        print(f"running in {how.out}: results are in {how.out / 'results'}", file=sys.stderr)
+    replace_process(command)
+
+
+def _running(options: dict[str, Any]) -> Running:
+    """The settings of ``_add_running``.
+
+    Raises:
+        UserError: An option is neither the command's nor Snakemake's.
+    """
+    check_passed_options(options["options"], options.pop("parser"))
+    return Running(**options)
 
 
 def run_command(folder: Path, name: str | None, how: Running) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -13,6 +14,18 @@ from stages.workflow.registry import STAGES
 _OF_ALL = ("results/benchmark.csv", "results/benchmark.json", "results/index.html")
 _RULES = ("all", "benchmark")
 _MAIN = "metrics.json"
+_NO_RULE = re.compile(r"MissingRuleException.*?No rule to produce (.+?) \(if you use", re.DOTALL)
+
+
+def explain_missing_rule(text: str, data_root: Path, scenes: Sequence[str]) -> UserError | None:
+    """The error of ``unknown_target`` for Snakemake's message about a target that no rule makes;
+    None for another message.
+
+    Args:
+        text: The message.
+    """
+    found = _NO_RULE.search(text)
+    return None if found is None else unknown_target(found[1], data_root, scenes)
 
 
 def unknown_target(target: str, data_root: Path, scenes: Sequence[str]) -> UserError:

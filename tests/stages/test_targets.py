@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from snakemake.exceptions import MissingRuleException
 
-from stages.workflow.targets import unknown_target
+from stages.workflow.targets import explain_missing_rule, unknown_target
 
 MEANT = {
     "results/door": "results/door/metrics.json",
@@ -33,6 +34,13 @@ def test_the_target_that_was_meant_is_named(target: str) -> None:
     error = str(unknown_target(target, Path("photos"), ["door", "garden"]))
     assert f"(did you mean {MEANT[target]}?)" in error
     assert error.startswith(f"{target}: ") and "results/benchmark.csv" in error
+
+
+def test_snakemakes_message_about_a_missing_rule_is_known() -> None:
+    text = f"MissingRuleException:\n{MissingRuleException('results/dor')}"
+    found = explain_missing_rule(text, Path("photos"), ["door"])
+    assert found is not None and "(did you mean results/door/metrics.json?)" in str(found)
+    assert explain_missing_rule("Error in rule train:", Path("photos"), ["door"]) is None
 
 
 def test_a_scene_that_is_not_there_is_looked_for_in_data_root() -> None:

@@ -38,7 +38,7 @@ def _entry(name: str, text: str) -> str:
         example = None if meant is None else f"--config {meant}={text[:40]}"
         raise UserError(
             f"--config {name}: no such option{did_you_mean(example)}",
-            fix=f"{COMMAND} options lists all options and explains those that it is given",
+            fix=f"{COMMAND} options lists all options, {COMMAND} options NAME explains one",
         )
     if sections[0] == "data_root":
         raise UserError("--config data_root: FOLDER says where the photographs are", fix="omit it")

@@ -17,15 +17,15 @@ _MAIN = "metrics.json"
 _NO_RULE = re.compile(r"MissingRuleException.*?No rule to produce (.+?) \(if you use", re.DOTALL)
 
 
-def explain_missing_rule(text: str, data_root: Path, scenes: Sequence[str]) -> UserError | None:
-    """The error of ``unknown_target`` for Snakemake's message about a target that no rule makes;
-    None for another message.
-
-    Args:
-        text: The message.
-    """
+def explain_missing_rule(text: str, data_root: Path) -> str:
+    """The message to show for one of Snakemake: that of ``unknown_target`` if no rule makes a
+    target, else ``text``."""
     found = _NO_RULE.search(text)
-    return None if found is None else unknown_target(found[1], data_root, scenes)
+    if found is None:
+        return text
+    folders = data_root.iterdir() if data_root.is_dir() else ()
+    scenes = sorted(path.name for path in folders if path.is_dir() and path.name[0] not in "._")
+    return f"error: {unknown_target(found[1], data_root, scenes)}"
 
 
 def unknown_target(target: str, data_root: Path, scenes: Sequence[str]) -> UserError:

@@ -36,11 +36,13 @@ def test_the_target_that_was_meant_is_named(target: str) -> None:
     assert error.startswith(f"{target}: ") and "results/benchmark.csv" in error
 
 
-def test_snakemakes_message_about_a_missing_rule_is_known() -> None:
+def test_snakemakes_message_about_a_missing_rule_is_known(tmp_path: Path) -> None:
+    (tmp_path / "door").mkdir()
     text = f"MissingRuleException:\n{MissingRuleException('results/dor')}"
-    found = explain_missing_rule(text, Path("photos"), ["door"])
-    assert found is not None and "(did you mean results/door/metrics.json?)" in str(found)
-    assert explain_missing_rule("Error in rule train:", Path("photos"), ["door"]) is None
+    shown = explain_missing_rule(text, tmp_path)
+    assert shown.startswith("error: results/dor: there is no scene 'dor'")
+    assert "(did you mean results/door/metrics.json?)" in shown
+    assert explain_missing_rule("Error in rule train:", tmp_path) == "Error in rule train:"
 
 
 def test_a_scene_that_is_not_there_is_looked_for_in_data_root() -> None:

@@ -37,8 +37,7 @@ def unknown_target(target: str, data_root: Path, scenes: Sequence[str]) -> UserE
         scenes: The names of all scenes.
     """
     what, meant = _fault(PurePath(target), data_root, scenes)
-    scene = next(iter(scenes), "NAME")
-    fix = f"name a file of a scene's results, such as results/{scene}/{_MAIN}, or {_OF_ALL[0]}"
+    fix = f"name a file of a scene's results, such as results/NAME/{_MAIN}, or {_OF_ALL[0]}"
     return UserError(f"{what}{did_you_mean(meant)}", file=target, fix=fix)
 
 

@@ -68,7 +68,6 @@ data/demo/demo.json: | extension
 # Fewer steps than the preset's: the demo is small, and shall be there within minutes.
 demo: extension data/demo/demo.json
 	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json --config 'train={"steps": 1500}'
-	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
 
 # More than two cores' worth: tests that run Snakemake start many programs, one after the other.
 WORKERS := 3

@@ -15,3 +15,7 @@ class EvaluateCounters(StageCounters):
     lpips: float | None = Field(
         description="Mean LPIPS; 0 for equal images, null where it was not measured."
     )
+
+    def headline(self) -> str:
+        lpips = "" if self.lpips is None else f", LPIPS {self.lpips:.3f}"
+        return f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}{lpips}"

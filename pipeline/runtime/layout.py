@@ -11,11 +11,18 @@ PACKAGES = Path(__file__).resolve().parents[2]
 
 IS_CHECKOUT = (PACKAGES / "Snakefile").is_file()
 
+COMMAND = "python -m pipeline" if IS_CHECKOUT else "splatmake"
+"""The command line of the program, for messages."""
+
 WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 """The folder of the Snakefile and of ``profiles/``; setup.py copies them there."""
 
 SCAN_CACHE = ".scratch/scan.json"
 """In a run's folder of results: facts about the files of its scene (``pipeline.io.fact_cache``)."""
+
+STAGE_OUTPUT = "SPLATMAKE_STAGE_OUTPUT"
+"""Environment variable: "log" if stages write to their logs alone, because Snakemake shows what
+they find."""
 
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
 """Native libraries in wheels."""

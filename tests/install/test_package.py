@@ -115,7 +115,7 @@ def reconstruction(tmp_path_factory: pytest.TempPathFactory, finished: Path) -> 
             (made.work / name / "__init__.py").write_text("raise SystemExit('not this one')\n")
         scene, config = str(made.photos), ("--config", *CONFIG)
         planned = made.run("splatmake", "plan", scene, *config, cwd=made.work)
-        assert "dry-run" in planned and not (made.work / "results/tiny/train").exists()
+        assert "dry run" in planned and not (made.work / "results/tiny/train").exists()
         made.run("splatmake", "run", scene, "--cores", "2", *config, cwd=made.work)
         made.run("splatmake", "run", scene, "--report", "report.zip", *config, cwd=made.work)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from tests.e2e import transcripts
 from tests.e2e.harness import TINY, make_project, make_scene, rules_run, snakemake
 from tests.videos import texture
 
@@ -46,6 +47,7 @@ def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path
     failed = snakemake(project, TABLE, config=CONFIG, check=False)
     assert failed.returncode != 0
     assert "Traceback" not in failed.stdout, failed.stdout
+    transcripts.check("batch", failed.stdout, lines=60)
     blamed = set(re.findall(r"^error in \w+ of (\S+):", failed.stdout, re.M))
     assert blamed == {"broken@plain", "broken@sh0"}
     assert not list(project.glob("results/broken*/metrics.json"))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.e2e import transcripts
 from tests.e2e.harness import (
     TINY,
     command,
@@ -91,5 +92,6 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert process.returncode == 130
+    transcripts.check("interrupted", said, lines=15)
     assert "Traceback" not in said, said
     assert not list(project.glob("results/tiny/.scratch/train/*/out"))

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.runs import Run
+from pipeline.coverage.record import CoverageRecord
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs
+from pipeline.reporting.verdict import judge
 from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.text import counted, duration, shortened
 
@@ -21,21 +23,20 @@ def headline(metrics: Metrics) -> str:
     error = f", rotation error {pose.rotation_median_deg:.3f} degrees" if pose and known else ""
     warned = f", {counted(len(metrics.warnings), 'warning')}" if metrics.warnings else ""
     return (
-        f"{metrics.scene}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}{lpips}, "
+        f"PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}{lpips}, "
         f"{counted(metrics.num_gaussians, 'Gaussian')}, "
         f"{metrics.registered_images} of {metrics.total_images} photographs{error}{warned}"
     )
 
 
 def finished_line(folder: Path) -> str:
-    """One line on a finished run: its result, and the time that all its stages took.
+    """One line on a finished run: its grade, its result, and the time that all its stages took.
 
     Raises:
         UserError: A record of the run is missing or damaged.
     """
     metrics = read_metrics(folder)
-    runs = read_runs(metrics, folder).values()
-    return f"{headline(metrics)}, {duration(sum(run.wall_s + run.earlier_s for run in runs))}"
+    return f"{metrics.scene}: {judge(metrics).grade}, {_with_time(metrics, folder)}"
 
 
 def result_lines(folder: Path) -> list[str]:
@@ -49,12 +50,20 @@ def result_lines(folder: Path) -> list[str]:
     """
     exported = sorted(file.name for file in (folder / "export").glob("[!.]*.*"))
     files = [name for name in exported if name not in ("stage.json", "run.json")]
+    metrics = read_metrics(folder)
+    verdict = judge(metrics, CoverageRecord.read(folder / "coverage"))
     return [
-        finished_line(folder),
+        f"{metrics.scene}: {verdict.sentence}",
+        f"  {_with_time(metrics, folder)}",
         f"  page     {folder / 'report.html'}",
         *([f"  exports  {folder / 'export'}: {', '.join(files)}"] if files else []),
         f"  next     {COMMAND} view {folder}",
     ]
+
+
+def _with_time(metrics: Metrics, folder: Path) -> str:
+    runs = read_runs(metrics, folder).values()
+    return f"{headline(metrics)}, {duration(sum(run.wall_s + run.earlier_s for run in runs))}"
 
 
 def batch_lines(results: Path) -> list[str]:

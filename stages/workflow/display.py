@@ -26,6 +26,7 @@ from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.progress import ProgressState, progress_file, progress_text
 from pipeline.runtime.record import STAGE, read_run, read_stage
 from pipeline.runtime.text import counted, duration
+from stages.workflow.failures import reporting_errors
 from stages.workflow.folders import RESULTS
 from stages.workflow.internals import INTERRUPTED, Flow, listen, log_file
 from stages.workflow.outcomes import error_in, interrupted_at, last_lines
@@ -252,7 +253,8 @@ class RunDisplay:
             for warning in new:
                 self._print(f"  warning: {warning}")
         elif job.stage == "report":
-            self._print(finished_line(job.record.parents[1]))
+            with contextlib.suppress(UserError):  # The tables of the batch have a message.
+                self._print(finished_line(job.record.parents[1]))
 
     def _progress_lines(self) -> list[str]:
         """A line for each job that runs."""
@@ -305,7 +307,8 @@ class RunDisplay:
             return
         finished = [target.parent for target in targets if target.parent.parent == self._results]
         for folder in dict.fromkeys(finished):
-            self._print("\n".join(result_lines(folder)))
+            with reporting_errors(f"the result of {folder.name}"):
+                self._print("\n".join(result_lines(folder)))
         if not finished:
             self._print(f"up to date: {', '.join(map(str, targets))}")
 

@@ -29,6 +29,7 @@ from pipeline.photos.load import load_view
 from pipeline.plan.posed_scene import PosedScene, posed_scene
 from pipeline.render.views import Render, render_view
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import rerun_command
 from pipeline.runtime.machine import usable_cores
 from pipeline.scene.appearance import Appearance
 from pipeline.scene.views import View
@@ -182,8 +183,7 @@ def load(
         raise UserError(
             "expected a finished scene (results/NAME), found no train/gaussians.npz",
             file=folder,
-            fix="give the file of Gaussians as model, or train the scene: "
-            f"snakemake --cores all {folder}/metrics.json",
+            fix=f"give the file of Gaussians as model, or train the scene: {rerun_command(folder)}",
         )
     _warn(posed.warnings)
     gaussians = read_gaussians(file)

@@ -19,13 +19,14 @@ from typing import Any
 from pipeline.command.workflow import snakemake_command
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.termination import Terminated, raising_when_terminated
 from splatmake.files import warn
 from splatmake.scene import Scene, load
 
 # The number of lines of the pipeline's output that are kept for its error message.
 _KEPT_LINES = 2000
 # A message of the pipeline, whose further lines are indented.
-_MESSAGE = re.compile(r"^error(?: in [^:\n]+)?: .*(?:\n[ \t]+\S.*)*", re.M)
+_MESSAGE = re.compile(r"^error(?:: | in )(.*(?:\n[ \t]+\S.*)*)", re.M)
 _SHOWN_LINES = 20
 
 
@@ -61,6 +62,8 @@ def reconstruct(
         UserError: The folder or an option is wrong, or the pipeline failed, with its message.
         KeyboardInterrupt: The call was interrupted, after the pipeline has ended.
     """
+    if cores is not None and cores < 1:
+        raise UserError(f"cores: expected 1 or more, or None for all, found {cores}")
     folder, work = Path(os.path.abspath(photographs)), Path(os.path.abspath(out))
     with tempfile.TemporaryDirectory(prefix="splatmake-") as temporary:
         options = []
@@ -119,19 +122,22 @@ def _run(command: list[str], folder: Path, shown: bool) -> tuple[int, str]:
 
 @contextlib.contextmanager
 def _ended_with_this_process(child: subprocess.Popen[str]) -> Iterator[None]:
-    """If the block is left by an exception, such as KeyboardInterrupt, interrupt the child with its
-    own children, as Ctrl-C in a terminal does, and wait until it has ended; a second interrupt
-    kills it. The child has a process group of its own: in a notebook, an interrupt reaches only
-    this process."""
+    """If the block is left by an exception, such as KeyboardInterrupt, or this process is asked to
+    end, interrupt the child with its own children, as Ctrl-C in a terminal does, and wait until it
+    has ended; a second interrupt kills it. The child has a process group of its own: in a notebook,
+    an interrupt reaches only this process."""
     try:
-        yield
-    except BaseException:
-        try:
-            _signal_group(child, signal.SIGINT)
-            child.communicate()
-        except BaseException:
-            _signal_group(child, signal.SIGKILL)
-            raise
+        with raising_when_terminated():
+            try:
+                yield
+            except BaseException:
+                _signal_group(child, signal.SIGINT)
+                child.communicate()
+                raise
+    except BaseException as error:
+        _signal_group(child, signal.SIGKILL)
+        if isinstance(error, Terminated):  # What this process does when it is asked to end.
+            os.kill(os.getpid(), signal.SIGTERM)
         raise
 
 
@@ -146,7 +152,7 @@ def _failure(folder: Path, code: int, output: str) -> UserError:
     if messages:
         what, _, fix = messages[-1].partition("\n  what to do: ")
         return UserError(what, fix=fix or None)
-    end = "\n".join(output.splitlines()[-_SHOWN_LINES:])
+    end = "\n".join(output.rstrip().splitlines()[-_SHOWN_LINES:])
     return UserError(
         f"the pipeline ended with code {code}:\n{end}",
         file=folder,

@@ -17,6 +17,7 @@ from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.record import StageRecord
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.georeference import CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from splatmake import UserError
@@ -65,6 +66,8 @@ def error(folder: Path) -> str:
 
 def test_a_finished_scene_is_loaded(results: Path) -> None:
     scene = splatmake.load(results)
+    assert repr(scene) == "Scene('barn': 5 Gaussians, 3 views, 1 test)"
+    np.testing.assert_allclose(scene.up, (0, -1, 0), atol=1e-12)
     assert [view.name for view in scene.test_views] == ["0.png"] and len(scene.views) == 3
 
 
@@ -115,3 +118,30 @@ def test_gains_of_other_views_are_one_error(results: Path) -> None:
 def test_a_missing_model_is_one_error(results: Path) -> None:
     (results / "train" / "gaussians.npz").unlink()
     assert "found no train/gaussians.npz" in error(results)
+
+
+def test_exports_are_in_the_unit_of_given_poses(results: Path, tmp_path: Path) -> None:
+    """A scene that was scaled for training renders the same from its exported files."""
+    Georeference(
+        method="given",
+        origin=CartesianOrigin(x=100, y=0, z=0),
+        residuals_m=None,
+        axes="",
+        unit="",
+        projection=None,
+        scale=10,
+        rotation=((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        translation=(-1000, 0, 0),
+        residuals=(),
+    ).write(results / "inspect")
+    scene = splatmake.load(results)
+    for suffix in (".ply", ".npz"):
+        file = tmp_path / f"a{suffix}"
+        scene.export(file, morton_order=False)
+        ratio = scene.gaussians.means / splatmake.read_gaussians(file).means
+        np.testing.assert_allclose(ratio, 10 if suffix == ".ply" else 1, rtol=1e-6)
+        again = splatmake.load(results, file)
+        for view in scene.views:
+            ours, theirs = scene.render(view), again.render(again.view(view.name))
+            assert ours.rgb.std() > 0
+            np.testing.assert_allclose(ours.rgb, theirs.rgb, atol=1e-4)

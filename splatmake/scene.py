@@ -248,8 +248,8 @@ def load(
         raise UserError(
             "expected a finished scene (results/NAME), found no train/gaussians.npz",
             file=folder,
-            fix="give the file of Gaussians as model, or train the scene: "
-            f"snakemake --cores all {folder}/metrics.json",
+            fix="give the file of Gaussians as model, or reconstruct the photographs with "
+            "splatmake.reconstruct",
         )
     found: list[str] = []
     gaussians = splat_files.read_gaussians(file, found)

@@ -183,9 +183,14 @@ def test_the_examples_of_the_python_api_run(installed: Path, tmp_path: Path) -> 
     (tmp_path / "examples.py").write_text("print('EXAMPLE')\n".join(EXAMPLES))
     printed = run(installed, "python", "-W", "ignore", "examples.py", cwd=tmp_path).stdout
     parts = printed.split("EXAMPLE\n")
+    # The output that the guide shows is the program's but for the numbers, which vary by machine.
+    shown = re.findall(r"^print\(.+\)  # (.+)$", GUIDE, re.M)
+    assert len(shown) == 2
+    assert {re.sub(r"\d+", "0", line) for line in shown} <= {
+        re.sub(r"\d+", "0", line) for line in printed.splitlines()
+    }
     results = tmp_path / "scenes/results/garden"
     metrics = json.loads((results / "metrics.json").read_text())
-    assert parts[0].startswith("Scene('garden': ")
     assert len(parts[0].splitlines()) == 1
     assert parts[2].startswith(f"Quality(PSNR {metrics['psnr']:.2f} dB, ")
     each = [f"{view['name']} {view['psnr']:.2f} dB" for view in metrics["per_view"]]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.command.workflow import snakemake_command
+from pipeline.config.load import load_project
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.termination import Terminated, raising_when_terminated
@@ -64,6 +65,8 @@ def reconstruct(
     """
     if cores is not None and cores < 1:
         raise UserError(f"cores: expected 1 or more, or None for all, found {cores}")
+    # Snakemake checks the options, too, but takes seconds to start.
+    load_project(dict(config or {}) | ({} if preset is None else {"preset": preset}))
     folder, work = Path(os.path.abspath(photographs)), Path(os.path.abspath(out))
     with tempfile.TemporaryDirectory(prefix="splatmake-") as temporary:
         options = []

@@ -71,9 +71,21 @@ def test_output_is_shown_on_request(
     assert called["cores"] == "3" and called["scene"] == Path("photos").absolute()
 
 
-def test_a_wrong_number_of_cores_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cores: expected 1 or more"):
-        splatmake.reconstruct(tmp_path, cores=0)
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"cores": 0}, "cores: expected 1 or more"),
+        ({"preset": "quick"}, "preset: Input should be 'fast'"),
+        ({"config": {"train": {"steps": None}}}, "train.steps: .*found None"),
+        ({"out": __file__}, "expected a folder for the results"),
+    ],
+)
+def test_a_wrong_argument_is_an_error_before_the_pipeline_starts(
+    wrong: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(subprocess, "Popen")
+    with pytest.raises(UserError, match=said):
+        splatmake.reconstruct(tmp_path, **wrong)
 
 
 # A pipeline with a job, which says its process and takes as long as nobody interrupts it.

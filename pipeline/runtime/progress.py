@@ -16,6 +16,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TextIO, TypeVar
 
@@ -207,7 +208,7 @@ class Progress:
             self._last_line = now
         if isinstance(sys.stderr, Console):
             sys.stderr.progress(self.line(note), keep=due)
-        elif due:
+        elif due and _shown.get():
             print(self.line(note), file=sys.stderr, flush=True)
 
     def rate(self) -> float:
@@ -255,3 +256,16 @@ def track(items: Iterable[T], label: str, total: int, unit: str = "it") -> Itera
     for item in items:
         yield item
         progress.advance()
+
+
+_shown = ContextVar("_shown", default=True)
+
+
+@contextlib.contextmanager
+def progress_shown(shown: bool) -> Iterator[None]:
+    """Whether the progress of the work in the block is shown on stderr."""
+    token = _shown.set(shown)
+    try:
+        yield
+    finally:
+        _shown.reset(token)

@@ -17,7 +17,7 @@ from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache, write_depths, write_renders
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
-from pipeline.surface.mesh import build_mesh
+from pipeline.surface.mesh import Mesh, build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
 from pipeline.surface.tsdf import BLOCK
 from pipeline.surface.video import write_video
@@ -61,7 +61,10 @@ def write_rendered(
             if "depths" in formats:
                 write_depths(out / "depths", renders)
             if "mesh" in formats:
-                _write_mesh(out, DepthMaps(renders), up, mesh_voxel, options.threads, messages)
+                mesh = make_mesh(DepthMaps(renders), mesh_voxel, options.threads, messages)
+                if mesh is not None:
+                    write_mesh_ply(out / "mesh.ply", mesh)
+                    write_mesh_glb(out / "mesh.glb", mesh, up)
     if "video" in formats:
         path = camera_path(views, _typical_depth(gaussians, views, options), up)
         describe_path(path).write(out)
@@ -73,14 +76,15 @@ def write_rendered(
     return messages
 
 
-def _write_mesh(
-    out: Path,
-    depths: DepthMaps,
-    up: NDArray[np.float64],
-    voxel: float | None,
-    threads: int,
-    messages: Messages,
-) -> None:
+def make_mesh(
+    depths: DepthMaps, voxel: float | None, threads: int, messages: Messages
+) -> Mesh | None:
+    """The mesh of the surfaces in depth maps; None, with a warning, if there is none.
+
+    Args:
+        voxel: The argument of ``build_mesh``.
+        messages: The messages that those about the mesh are added to.
+    """
     mesh, grid = build_mesh(depths, voxel, threads)
     if mesh is None or grid is None:
         why = "the depth maps of the views contain no common surface"
@@ -90,9 +94,7 @@ def _write_mesh(
                 f"surfaces are up to {grid.far:.4g} away; lower it, or leave it out"
             )
         messages.warnings.append(f"no mesh: {why}")
-        return
-    write_mesh_ply(out / "mesh.ply", mesh)
-    write_mesh_glb(out / "mesh.glb", mesh, up)
+        return None
     messages.decisions.append(
         f"mesh: {len(mesh.faces)} triangles from {len(depths)} views, voxels of {grid.voxel:.4g} "
         f"(scene unit), surfaces up to {grid.far:.4g} away"
@@ -102,6 +104,7 @@ def _write_mesh(
             f"export.mesh_voxel: voxels of {voxel:.4g} need too much memory, or are far smaller "
             f"than a pixel of the views; used {grid.voxel:.4g}"
         )
+    return mesh
 
 
 def _typical_depth(gaussians: Gaussians, views: list[View], options: RasterOptions) -> float:

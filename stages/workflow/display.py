@@ -32,6 +32,7 @@ from stages.workflow.internals import INTERRUPTED, Flow, listen, log_file
 from stages.workflow.outcomes import error_in, interrupted_at, last_lines
 from stages.workflow.registry import STAGES
 from stages.workflow.screen import Screen
+from stages.workflow.targets import explain_missing_rule
 
 # Seconds between two looks at the files of running jobs, on a terminal and elsewhere, and between
 # two lines of progress where there is no terminal.
@@ -87,10 +88,14 @@ class RunDisplay:
     Args:
         results: The folder of all runs' results.
         started: The time at which Snakemake was started. Older logs are those of other runs.
+
+    Attributes:
+        data_root: The folder of the scenes.
     """
 
     def __init__(self, flow: Flow, screen: Screen, results: Path, started: float):
         self._flow, self._screen, self._results, self._started = flow, screen, results, started
+        self.data_root = Path("data")
         self._lock = threading.RLock()
         self._plans: dict[str, Plan] = {}
         self._pending: list[StageJob] = []
@@ -228,7 +233,7 @@ class RunDisplay:
 
     def message(self, text: str) -> None:
         """Show a message."""
-        self._screen.print(text)
+        self._screen.print(explain_missing_rule(text, self.data_root))
 
     def _watch(self) -> None:
         seconds = _LIVE_SECONDS if self._screen.live else _SECONDS

@@ -99,12 +99,12 @@ class SnakemakeProject:
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
-        self._root = Path(self._project.data_root)
+        self._display = display or show_run(workflow)
+        self._root = self._display.data_root = Path(self._project.data_root)
         for name in named:
             if name_fault(name) or not (self._root / name).is_dir():
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
-        self._display = display or show_run(workflow)
         self._lost: set[Path] = set()
         # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,14 +204,19 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
     return gaussians
 
 
-def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
+def write_gaussians(
+    file: str | PathLike[str], gaussians: Gaussians, *, spz_version: Literal[3, 4] = 3
+) -> None:
     """Write Gaussians in the format of the file's suffix. A warning names what the format does not
     hold.
+
+    Args:
+        spz_version: The version of an SPZ file.
 
     Raises:
         UserError: The suffix is unknown, or the format cannot hold the Gaussians.
     """
-    _warn(splat_files.write_gaussians(Path(file), gaussians))
+    _warn(splat_files.write_gaussians(Path(file), gaussians, spz_version=spz_version))
 
 
 def _warn(messages: Sequence[str]) -> None:

@@ -384,6 +384,11 @@ class Export(Section):
         "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
         "path).",
     )
+    spz_version: Literal[3, 4] = Field(
+        3,
+        description="Version of the format SPZ. 3 (gzip) is read by more programs; 4 (zstd) holds "
+        "up to 30 million Gaussians instead of 10.",
+    )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")
     mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(

@@ -283,6 +283,12 @@ def test_default_formats(scene):
     }
 
 
+@pytest.mark.parametrize(("version", "magic"), [(3, b"\x1f\x8b"), (4, b"NGSP")])
+def test_the_version_of_spz_is_an_option(scene, version, magic):
+    out, _ = export(scene, formats=["spz"], spz_version=version)
+    assert (out / "point_cloud.spz").read_bytes().startswith(magic)
+
+
 def test_pruning_everything_is_an_error(scene):
     with pytest.raises(UserError, match="have an opacity below"):
         export(scene, min_opacity=1.0)

@@ -298,6 +298,14 @@ def test_a_hostile_file_is_one_error_and_takes_no_memory(case) -> None:
     assert peak < 2_000_000
 
 
+def test_a_version_that_holds_too_few_gaussians_is_an_error(monkeypatch) -> None:
+    monkeypatch.setitem(spz_container.MAX_GAUSSIANS, 3, 9)
+    assert len(decode_spz(encode_spz(sample(10), version=4))) == 10
+    with pytest.raises(UserError, match="version 3 can hold up to 9 Gaussians, found 10") as caught:
+        encode_spz(sample(10))
+    assert "spz_version: 4" in caught.value.fix
+
+
 def test_more_gaussians_than_fit_into_the_memory_are_an_error(monkeypatch) -> None:
     data = encode_spz(sample(300))
     monkeypatch.setattr(spz_container, "usable_memory", lambda: 8 * 300 * 65 - 1)

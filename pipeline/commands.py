@@ -22,7 +22,6 @@ from pipeline.io.splat_files import (
     read_gaussians,
     write_gaussians,
 )
-from pipeline.io.spz import SpzVersion
 from pipeline.metrics.evaluate import evaluate_views
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.metrics.protocol import choose_protocol
@@ -61,14 +60,14 @@ def convert(
     sh_degree: int,
     min_opacity: float,
     morton_order: bool,
-    spz_version: SpzVersion,
+    spz_version: int,
     warnings: list[str],
 ) -> list[str]:
     """Convert a file of Gaussians to the format of ``target``'s suffix.
 
     Args:
         sh_degree, min_opacity, morton_order: The arguments of ``splats.reduce.reduce_gaussians``.
-        spz_version: The version of an SPZ file that is written.
+        spz_version: The version of an SPZ file that is written, 3 or 4.
         warnings: The list that warnings are added to, also of what ``target`` does not hold.
 
     Returns:

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,13 +204,13 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
 
 
 def write_gaussians(
-    file: str | PathLike[str], gaussians: Gaussians, *, spz_version: Literal[3, 4] = 3
+    file: str | PathLike[str], gaussians: Gaussians, *, spz_version: int = 3
 ) -> None:
     """Write Gaussians in the format of the file's suffix. A warning names what the format does not
     hold.
 
     Args:
-        spz_version: The version of an SPZ file.
+        spz_version: The version of an SPZ file, 3 or 4.
 
     Raises:
         UserError: The suffix is unknown, or the format cannot hold the Gaussians.

@@ -113,7 +113,8 @@ def test_every_format_the_schema_offers_is_written(scene):
     )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
     assert job.counters == ExportCounters(exported_gaussians=len(kept))
-    for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
+    files = ((".ply", 1), (".spz", 1), ("_v4.spz", 1), (".glb", 1), (".splat", 0))
+    for suffix, degree in files:
         found = read_gaussians(out / f"point_cloud{suffix}", [])
         assert len(found) == len(kept) and found.sh_degree == degree
         np.testing.assert_allclose(found.means, kept.means, atol=1e-5)
@@ -281,12 +282,6 @@ def test_default_formats(scene):
         *("point_cloud.ply", "point_cloud.spz", "points.ply", "transforms.json", "frame.json"),
         *(f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")),
     }
-
-
-@pytest.mark.parametrize(("version", "magic"), [(3, b"\x1f\x8b"), (4, b"NGSP")])
-def test_the_version_of_spz_is_an_option(scene, version, magic):
-    out, _ = export(scene, formats=["spz"], spz_version=version)
-    assert (out / "point_cloud.spz").read_bytes().startswith(magic)
 
 
 def test_pruning_everything_is_an_error(scene):

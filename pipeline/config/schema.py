@@ -348,6 +348,7 @@ ExportFormat = Literal[
     "ply",
     "blocks",
     "spz",
+    "spz4",
     "splat",
     "gltf",
     "points",
@@ -376,18 +377,14 @@ class Export(Section):
     formats: ExportFormats = Field(
         ("ply", "spz", "points", "colmap", "transforms"),
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
-        "scene), spz (a sixth of the size), splat (without SH), gltf (.glb with "
+        "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
+        "read, for up to 30 million Gaussians instead of 10), splat (without SH), gltf (.glb with "
         "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
         "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Rendered from "
         "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
         "path).",
-    )
-    spz_version: Literal[3, 4] = Field(
-        3,
-        description="Version of the format SPZ. 3 (gzip) is read by more programs; 4 (zstd) holds "
-        "up to 30 million Gaussians instead of 10.",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")

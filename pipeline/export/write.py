@@ -19,7 +19,7 @@ from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.splat import write_splat
 from pipeline.io.splat_losses import losses, unmarked
-from pipeline.io.spz import SpzVersion, write_spz
+from pipeline.io.spz import write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
@@ -36,7 +36,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
 # The formats of one file with the Gaussians.
-GAUSSIAN_FORMATS = ("ply", "spz", "splat", "gltf")
+GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "splat", "gltf")
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,6 @@ class _Files:
         blocks: (M,) numbers of the block of each of ``gaussians``.
         model, views: The values of ``scene`` in the given world, for formats in double precision.
         antialias: Whether the Gaussians were trained with opacity compensation.
-        spz_version: The version of the format SPZ.
         points: The name of the file of points; None without one.
         normalization: The transformation from the given world to the scene's.
     """
@@ -103,7 +102,6 @@ class _Files:
     model: Reconstruction
     views: list[View]
     antialias: bool
-    spz_version: SpzVersion
     points: str | None
     normalization: Normalization
 
@@ -112,8 +110,8 @@ class _Files:
         """Whether the given world has another origin than the scene's."""
         return bool(self.scene.normalization.origin.any())
 
-    def write_spz(self, path: Path) -> None:
-        write_spz(path, self.gaussians, antialias=self.antialias, version=self.spz_version)
+    def write_spz(self, path: Path, version: int) -> None:
+        write_spz(path, self.gaussians, antialias=self.antialias, version=version)
 
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
@@ -149,7 +147,8 @@ class _Files:
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
     "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
-    "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path)),
+    "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
+    "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),
@@ -188,17 +187,7 @@ def export_scene(
     blocks = _blocks_of(means[gaussians.rows], scene.partition)
     has_points = "points" in config.formats and len(scene.model.points) > 0
     points = WRITERS["points"][0] if has_points else None
-    files = _Files(
-        scene,
-        gaussians,
-        blocks,
-        model,
-        views,
-        antialias=train.antialias,
-        spz_version=config.spz_version,
-        points=points,
-        normalization=normalization,
-    )
+    files = _Files(scene, gaussians, blocks, model, views, train.antialias, points, normalization)
     written = []
     for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]

@@ -13,7 +13,7 @@ from pipeline.io.npz import read_npz, write_npz
 from pipeline.io.ply import read_splat_ply, write_splat_ply
 from pipeline.io.splat import read_splat, write_splat
 from pipeline.io.splat_losses import losses, losses_of_reading, unmarked
-from pipeline.io.spz import SpzVersion, read_antialias, read_spz, write_spz
+from pipeline.io.spz import read_antialias, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
 from pipeline.splats.gaussians import Gaussians
@@ -81,13 +81,13 @@ def write_gaussians(
     gaussians: GaussianSource,
     *,
     antialias: bool = False,
-    spz_version: SpzVersion = 3,
+    spz_version: int = 3,
 ) -> list[str]:
     """Write Gaussians atomically, in the format of the suffix.
 
     Args:
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
-        spz_version: The version of an SPZ file.
+        spz_version: The version of an SPZ file, 3 or 4.
 
     Returns:
         A sentence for everything that the format does not hold (``splat_losses``).

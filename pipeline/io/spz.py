@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,6 @@ from pipeline.splats.axes import RUB, Flipped, flip
 from pipeline.splats.gaussians import Gaussians
 
 Doubles = NDArray[np.float64]
-#: The versions that are written.
-SpzVersion = Literal[3, 4]
 
 # Quantisation steps per unit of the DC coefficient, as in Niantic's encoder; 8 bits then cover
 # colours beyond [0, 1]. Higher coefficients are written with all 8 bits; other encoders keep 5 or 4
@@ -52,7 +50,7 @@ _FIX = "write the file again as SPZ version 3 or 4, or get an intact copy of it"
 
 
 def write_spz(
-    path: Path, gaussians: GaussianSource, *, antialias: bool = False, version: SpzVersion = 3
+    path: Path, gaussians: GaussianSource, *, antialias: bool = False, version: int = 3
 ) -> None:
     """Write an SPZ file atomically; see ``encode_spz``."""
     write_pieces(path, _pieces(gaussians, antialias, version))
@@ -84,27 +82,29 @@ def ignored_content(path: Path) -> list[str]:
     return ignored
 
 
-def encode_spz(
-    gaussians: GaussianSource, *, antialias: bool = False, version: SpzVersion = 3
-) -> bytes:
+def encode_spz(gaussians: GaussianSource, *, antialias: bool = False, version: int = 3) -> bytes:
     """The bytes of an SPZ file; the same Gaussians always give the same bytes.
 
     Args:
         gaussians: The Gaussians in the world's axes.
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation,
             with which viewers should render them.
-        version: The version of the format.
+        version: The version of the format, 3 or 4.
 
     Raises:
-        UserError: There are more Gaussians than the version allows (``MAX_GAUSSIANS``).
+        UserError: The version is another, or cannot hold so many Gaussians (``MAX_GAUSSIANS``).
     """
     return b"".join(_pieces(gaussians, antialias, version))
 
 
-def _pieces(gaussians: GaussianSource, antialias: bool, version: SpzVersion) -> Iterator[bytes]:
+def _pieces(gaussians: GaussianSource, antialias: bool, version: int) -> Iterator[bytes]:
+    if version not in (3, 4):
+        raise UserError(
+            f"expected SPZ version 3 or 4, found {version}", fix="write one of these versions"
+        )
     count, limit = len(gaussians), MAX_GAUSSIANS[version]
     if count > limit:
-        other = ", set export.spz_version: 4" if count <= MAX_GAUSSIANS[4] else ""
+        other = ", write version 4 (spz4 in export.formats)" if count <= MAX_GAUSSIANS[4] else ""
         raise UserError(
             f"an SPZ file of version {version} can hold up to {limit} Gaussians, found {count}",
             fix=f"export fewer of the faint Gaussians (export.min_opacity){other}, or write a PLY",

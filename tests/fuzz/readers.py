@@ -20,7 +20,6 @@ from pipeline.io.gcp import read_ground_control
 from pipeline.io.llff import read_poses_bounds
 from pipeline.io.photofile import read_facts
 from pipeline.io.splat_files import read_gaussians, write_gaussians
-from pipeline.io.spz import SpzVersion
 from pipeline.io.transforms import write_transforms
 from pipeline.io.videofile import read_video_facts
 from pipeline.photos.load import read_depth, read_picture
@@ -102,7 +101,7 @@ def read_colmap(folder: Path) -> object:
     return fit_to_photos(read_model(folder), by_name, str(folder))
 
 
-def gaussian_seeds(suffix: str, spz_version: SpzVersion = 3) -> Callable[[], Sequence[Files]]:
+def gaussian_seeds(suffix: str, spz_version: int = 3) -> Callable[[], Sequence[Files]]:
     def make() -> Sequence[Files]:
         found = []
         for degree in (3, 1, 0):

@@ -303,7 +303,9 @@ def test_a_version_that_holds_too_few_gaussians_is_an_error(monkeypatch) -> None
     assert len(decode_spz(encode_spz(sample(10), version=4))) == 10
     with pytest.raises(UserError, match="version 3 can hold up to 9 Gaussians, found 10") as caught:
         encode_spz(sample(10))
-    assert "spz_version: 4" in caught.value.fix
+    assert "version 4" in caught.value.fix
+    with pytest.raises(UserError, match="version 3 or 4, found 2"):
+        encode_spz(sample(10), version=2)
 
 
 def test_more_gaussians_than_fit_into_the_memory_are_an_error(monkeypatch) -> None:

@@ -174,8 +174,10 @@ def _unpack_zstd(data: bytes) -> tuple[Header, bytes, bytes]:
         )
     parts = []
     for size, (packed, found) in zip(sizes, _STREAM.iter_unpack(data[table:start]), strict=True):
-        if found != size or packed > len(data) - start:
-            raise ValueError(_mismatch(header, size, f"{found}, compressed to {packed}"))
+        if found != size:
+            raise ValueError(_mismatch(header, size, str(found)))
+        if packed > len(data) - start:
+            raise ValueError(f"expected a stream of {packed} bytes, found {len(data) - start}")
         parts.append(_expand(memoryview(data)[start : start + packed], size))
         if len(parts[-1]) != size:
             raise ValueError(_mismatch(header, size, str(len(parts[-1]))))

@@ -77,7 +77,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
                 raise UserError(
                     "expected an ordinary PLY file, found SuperSplat's compressed one",
                     file=path,
-                    fix="write it again as an ordinary PLY file, with SuperSplat or splat-transform",
+                    fix="convert it to an ordinary PLY file, as with splat-transform",
                 )
             case ["element", name, count]:
                 elements.append((name, count))

@@ -23,14 +23,19 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
     return gaussians
 
 
-def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
+def write_gaussians(
+    file: str | PathLike[str], gaussians: Gaussians, *, spz_version: int = 3
+) -> None:
     """Write Gaussians as they are, in the format of the file's suffix. A warning names what the
     format does not hold. ``Scene.export`` writes those of a scene in the unit of its poses.
+
+    Args:
+        spz_version: The version of an SPZ file, 3 or 4.
 
     Raises:
         UserError: The suffix is unknown, or the format cannot hold the Gaussians.
     """
-    warn(splat_files.write_gaussians(Path(file), gaussians))
+    warn(splat_files.write_gaussians(Path(file), gaussians, spz_version=spz_version))
 
 
 def warn(messages: Iterable[str]) -> None:

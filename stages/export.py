@@ -85,5 +85,12 @@ SPEC = StageSpec(
     },
     optional=("partition",),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
-    packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
+    packages=(
+        "torch",
+        "numpy",
+        "zstandard",
+        "scipy",
+        "scikit-image",
+        "opencv-contrib-python-headless",
+    ),
 )

@@ -113,7 +113,8 @@ def test_every_format_the_schema_offers_is_written(scene):
     )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
     assert job.counters == ExportCounters(exported_gaussians=len(kept))
-    for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
+    files = ((".ply", 1), (".spz", 1), ("_v4.spz", 1), (".glb", 1), (".splat", 0))
+    for suffix, degree in files:
         found = read_gaussians(out / f"point_cloud{suffix}", [])
         assert len(found) == len(kept) and found.sh_degree == degree
         np.testing.assert_allclose(found.means, kept.means, atol=1e-5)
@@ -264,14 +265,15 @@ def test_transforms_omit_an_empty_point_cloud(scene):
 
 
 def test_frame_json_describes_the_coordinate_frame(scene):
-    out, _ = export(scene, formats=["ply", "gltf"])
+    out, _ = export(scene, formats=["ply", "spz", "spz4", "gltf", "splat"])
     found = json.loads((out / "frame.json").read_text())
     assert found["up"] == [0, -1, 0]
     assert found["cameras"]["centre"] == [-4, 0, -4]
     assert found["gaussians"] == {"count": 50, "sh_degree": 3}
     # Trained on random backgrounds, shown on white.
     assert found["render"]["background"] == [1, 1, 1]
-    assert list(found["axes_of"]) == ["point_cloud.glb"]
+    turned = {f"point_cloud{end}" for end in (".spz", "_v4.spz", ".glb")}
+    assert found["axes_of"].keys() == turned
 
 
 def test_default_formats(scene):

@@ -162,6 +162,8 @@ def _add_convert(add: Callable[..., object]) -> None:
     add("--min-opacity", type=types.share, default=0.0, metavar="SHARE", help=text)
     text = "sort along a Z-order curve: smaller files"
     add("--morton-order", action="store_true", help=text)
+    text = "version of an .spz file (default 3, which more programs read)"
+    add("--spz-version", type=int, choices=(3, 4), default=3, help=text)
 
 
 def _convert(**options: Any) -> None:

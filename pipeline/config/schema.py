@@ -349,6 +349,7 @@ ExportFormat = Literal[
     "ply",
     "blocks",
     "spz",
+    "spz4",
     "splat",
     "gltf",
     "points",
@@ -377,7 +378,8 @@ class Export(Section):
     formats: ExportFormats = Field(
         ("ply", "spz", "points", "colmap", "transforms"),
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
-        "scene), spz (a sixth of the size), splat (without SH), gltf (.glb with "
+        "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
+        "read, for up to 30 million Gaussians instead of 10), splat (without SH), gltf (.glb with "
         "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "

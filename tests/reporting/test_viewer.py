@@ -16,11 +16,13 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.io.ply import write_splat_ply
+from pipeline.io.splat_files import write_gaussians
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
+from pipeline.splats.arrays import collect
+from pipeline.splats.axes import RUB, Flipped
 from pipeline.splats.gaussians import Gaussians
 from tests.reporting.made import gaussians, report, trained
 from tests.tools import need_package
@@ -122,24 +124,32 @@ def test_the_scene_appears_without_network_requests(page: Any, file: Path) -> No
     assert page.locator("#space-tools select").is_enabled()
 
 
-@pytest.mark.parametrize(("kind", "antialias"), [("spz", False), ("spz", True), ("ply", False)])
+@pytest.mark.parametrize(
+    ("file", "antialias"), [(None, False), (None, True), ("scene.ply", False), ("scene.spz", False)]
+)
 def test_the_viewer_renders_as_our_rasterizer(
-    page: Any, tmp_path: Path, kind: str, antialias: bool
+    page: Any, tmp_path: Path, file: str | None, antialias: bool
 ) -> None:
-    """Spark's render of the page's SPZ, or of our PLY instead, against the rasterizer's."""
+    """Spark's render of the page, or of a file of ours in its place, against the rasterizer's.
+
+    Spark shows coordinates as they are in a file: y up for SPZ, y down for PLY.
+    """
     path = tmp_path / "report.html"
     scene = trained(gaussians=gaussians(3000), background=(0.2, 0.5, 1.0), antialias=antialias)
     write_report(report(trained=scene), path)
-    if kind == "ply":
-        write_splat_ply(tmp_path / "scene.ply", scene.gaussians)
-        ply = base64.b64encode((tmp_path / "scene.ply").read_bytes()).decode()
-        path.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, path.read_text("utf-8")), "utf-8")
+    shown = Gaussians.sharing(scene.gaussians)
+    if file is not None:
+        write_gaussians(tmp_path / file, shown)
+        text = base64.b64encode((tmp_path / file).read_bytes()).decode()
+        path.write_text(re.sub(r'(?<=id="splats">)[^<]+', text, path.read_text("utf-8")), "utf-8")
+    if file == "scene.spz":
+        shown = Gaussians.sharing(collect(Flipped(shown, RUB)))
     page.goto(path.as_uri())
     for view in scene.views[:3]:
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
         drawn = pixels(base64.b64decode(url.partition(",")[2]))
         options = RasterOptions(background=scene.background, antialias=antialias, near=scene.near)
-        ours = render_view(Gaussians.sharing(scene.gaussians), view, options).rgb
+        ours = render_view(shown, view, options).rgb
         assert drawn.shape == ours.shape
         psnr = -10 * np.log10(np.mean((drawn / 255 - np.rint(ours * 255) / 255) ** 2))
         assert psnr >= 38

@@ -16,7 +16,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from pipeline.command.workflow import snakemake_command
+from pipeline.command.workflow import Running, run_command
 from pipeline.config.load import load_project
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.errors import UserError
@@ -74,14 +74,15 @@ def reconstruct(
             file = Path(temporary) / "config.json"
             file.write_text(json.dumps(dict(config), default=str))
             options = ["--configfile", str(file)]
-        command = snakemake_command(
-            scene=folder,
+        how = Running(
+            out=None,
             preset=preset,
             cores="all" if cores is None else str(cores),
             config=(),
             profile=None,
             options=options,
         )
+        command = run_command(folder, None, how)
         try:
             work.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -28,7 +28,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> dict[str, Any]:
         called.update(arguments)
         return [sys.executable, "-c", code]
 
-    monkeypatch.setattr(reconstruction, "snakemake_command", command)
+    monkeypatch.setattr(reconstruction, "run_command", command)
     return called
 
 
@@ -105,7 +105,7 @@ def test_an_interruption_ends_the_pipeline_and_its_jobs(
     """Only this process gets the signal, as in a notebook."""
     code = (
         "import sys, splatmake\nfrom splatmake import reconstruction\n"
-        f"reconstruction.snakemake_command = lambda **_: [sys.executable, '-c', {RUN!r}]\n"
+        f"reconstruction.run_command = lambda *_: [sys.executable, '-c', {RUN!r}]\n"
         "splatmake.reconstruct('.', '.')\n"
     )
     user = subprocess.Popen(

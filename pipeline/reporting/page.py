@@ -22,7 +22,7 @@ from pipeline.reporting.data import SceneResults, TrainingRecord
 from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
-from pipeline.reporting.space import ViewerContent, viewer_content, viewer_script
+from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
 from pipeline.runtime.atomic import write_text
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.scene.reconstruction import Points
@@ -91,7 +91,7 @@ def report_html(results: SceneResults) -> str:
         )
 
     # The Gaussians get what the rest of the page leaves.
-    rest = page(ViewerContent("", Markup(), ""))
+    rest = page(ViewerContent("", Markup(), "", viewer_poster(results)))
     return page(viewer_content(results, _MAX_BYTES - len(rest)))
 
 

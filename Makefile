@@ -145,7 +145,8 @@ lock:
 VIEWER := pipeline/reporting/viewer
 viewer:
 	@mkdir -p build/viewer
-	@cp $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/viewer.js build/viewer
+	@rm -rf build/viewer/src
+	@cp -r $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/src build/viewer
 	@cd build/viewer && npm ci --ignore-scripts && npm run build
 	@cp build/viewer/viewer.min.js $(VIEWER)
 

@@ -25,7 +25,7 @@ from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
 from pipeline.reporting.names import with_own_names
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
-from pipeline.reporting.space import ViewerContent, viewer_content, viewer_script
+from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
 from pipeline.reporting.verdict import judge
 from pipeline.runtime.atomic import write_text
 from pipeline.scene.georeference import GeoreferenceSummary
@@ -100,7 +100,7 @@ def report_html(results: SceneResults) -> str:
         )
 
     # The Gaussians get what the rest of the page leaves.
-    rest = page(ViewerContent("", Markup(), ""))
+    rest = page(ViewerContent("", Markup(), "", viewer_poster(results)))
     return page(viewer_content(results, _MAX_BYTES - len(rest)))
 
 

@@ -24,8 +24,8 @@ def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> dict[str, Any]:
     """Let this Python code be the pipeline; returns the arguments that it is called with."""
     called: dict[str, Any] = {}
 
-    def command(**arguments: Any) -> list[str]:
-        called.update(arguments)
+    def command(folder: Path, name: str | None, how: Any) -> list[str]:
+        called.update(vars(how), scene=folder)
         return [sys.executable, "-c", code]
 
     monkeypatch.setattr(reconstruction, "run_command", command)

@@ -304,7 +304,8 @@ def test_one_finger_scrolls_the_page_until_the_scene_is_tapped(browser: Any, fil
         page.goto(file.as_uri())
         page.evaluate("viewer.ready")
         page.evaluate(
-            "document.getElementById('space').scrollIntoView({block: 'center', behavior: 'instant'})"
+            "document.getElementById('space').scrollIntoView("
+            "{block: 'center', behavior: 'instant'})"
         )
         touch = context.new_cdp_session(page)
 

@@ -55,12 +55,14 @@ class Quality:
 
     Attributes:
         psnr: The PSNR in dB.
+        flip: The mean FLIP error, 0 to 1.
         lpips: The LPIPS, or None if its weights are not installed.
         views: The quality of each view by its name; empty for a single view.
     """
 
     psnr: float
     ssim: float
+    flip: float | None
     lpips: float | None
     views: dict[str, Quality]
 
@@ -151,9 +153,10 @@ class Scene:
             )
         _warn(found.warnings)
         single = {
-            view.name: Quality(view.psnr, view.ssim, view.lpips, {}) for view in found.per_view
+            view.name: Quality(view.psnr, view.ssim, view.flip, view.lpips, {})
+            for view in found.per_view
         }
-        return Quality(found.psnr, found.ssim, found.lpips, single)
+        return Quality(found.psnr, found.ssim, found.flip, found.lpips, single)
 
 
 def load(

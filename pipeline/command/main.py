@@ -99,7 +99,7 @@ def make_parser() -> argparse.ArgumentParser:
     text = "convert Gaussians to another format, optionally with fewer coefficients"
     _add_convert(command("convert", _convert, text))
     _add_render(command("render", _render, "render Gaussians from given cameras, to PNG"))
-    text = "PSNR and SSIM of each view against its photograph"
+    text = "PSNR, SSIM and FLIP of each view against its photograph"
     about = f"Evaluate a model on the scene's test views: {text}, and their means."
     _add_evaluate(command("evaluate", _evaluate, text, about))
     text = "show a scene in the browser, also during training (needs viser)"
@@ -220,12 +220,12 @@ def _evaluate(**options: Any) -> None:
     found = evaluate(**options, how=how)
     width = max(len(view.name) for view in found.per_view)
     lines = [
-        f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}"
+        f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}  FLIP {view.flip:.4f}"
         for view in found.per_view
     ]
     protocol = found.protocol
     lpips = "" if found.lpips is None else f", LPIPS {found.lpips:.4f}"
-    means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}{lpips}"
+    means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, FLIP {found.flip:.4f}{lpips}"
     lines.append(f"{means}, {protocol.num_views} views")
     lines.append(f"({protocol.split}; {', '.join(protocol.resolution)} pixels)")
     _print(lines, found.warnings)

@@ -11,13 +11,17 @@ from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 def headline(metrics: Metrics) -> str:
     """One line: quality, number of Gaussians, poses, warnings."""
-    lpips = "n/a" if metrics.lpips is None else f"{metrics.lpips:.3f}"
+    perceptual = "".join(
+        f", {name} {value:.3f}"
+        for name, value in (("FLIP", metrics.flip), ("LPIPS", metrics.lpips))
+        if value is not None
+    )
     pose = metrics.pose_error
     known = pose is not None and pose.rotation_median_deg is not None
     error = f", rotation error {pose.rotation_median_deg:.3f} degrees" if pose and known else ""
     return (
-        f"{metrics.scene}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}, "
-        f"LPIPS {lpips}, {metrics.num_gaussians} Gaussians, "
+        f"{metrics.scene}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}{perceptual}, "
+        f"{metrics.num_gaussians} Gaussians, "
         f"{metrics.registered_images}/{metrics.total_images} images{error}, "
         f"{len(metrics.warnings)} warnings"
     )

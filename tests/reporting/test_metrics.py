@@ -114,7 +114,7 @@ def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
 
 
 def test_the_headline_has_quality_size_poses_and_time(folder, capsys):
-    line = "barn: PSNR 27.50 dB, SSIM 0.9000, LPIPS n/a, 1000 Gaussians, 6/8 images, 2 warnings"
+    line = "barn: PSNR 27.50 dB, SSIM 0.9000, FLIP 0.080, 1000 Gaussians, 6/8 images, 2 warnings"
     assert headline(read_metrics(folder)) == line
     assert main([str(folder / "metrics.json")]) == 0
     assert capsys.readouterr().out.startswith(f"{line}, 14 s\n")

@@ -261,14 +261,13 @@ def _lpips() -> Finding:
     topic = "LPIPS weights"
     if any(find_spec(name) is None for name in ("numpy", "torch")):
         return Finding(topic, "need torch", "absent")
-    from pipeline.metrics.lpips import weights_found
+    from pipeline.metrics.lpips import FETCH, weights_found
 
     found = {net: len(weights_found(net)) for net in ("vgg", "alex")}
     whole = [net for net, files in found.items() if files == 2]
     if whole:
         return Finding(topic, ", ".join(whole))
-    fix = "pipeline/metrics/lpips.py names the two files and their folder"
-    return Finding(topic, "not found: metrics.json has no LPIPS", "absent", fix)
+    return Finding(topic, "not found: metrics.json has no LPIPS", "absent", FETCH["vgg"])
 
 
 def _programs() -> list[Finding]:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.config.presets import PRESETS
 from pipeline.render.registry import DEVICE
@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   splatmake render scene.spz --cameras data/garden/sparse/0 -o renders
   splatmake evaluate point_cloud.ply --scene results/garden
   splatmake compare results/benchmark.json --base balanced
+  splatmake fetch lpips
   splatmake doctor
 
 In a checkout, `python -m pipeline` is the same command, and
@@ -116,6 +117,8 @@ def make_parser() -> argparse.ArgumentParser:
     _add_compare(command("compare", _compare, text, about))
     text = "write training curves for TensorBoard (needs tensorboard)"
     _add_tensorboard(command("tensorboard", _tensorboard, text))
+    text = "download the weights of LPIPS into torch's folder ($TORCH_HOME or ~/.cache/torch)"
+    _add_fetch(command("fetch", _fetch, text))
     text = "show what this machine has, what is used, and what is missing"
     about = (
         "Report processor, instruction set, compilers, memory, graphics cards, packages and disk "
@@ -315,6 +318,18 @@ def _tensorboard(**options: Any) -> None:
     from pipeline.watching.tensorboard import write_events
 
     _print(write_events(**options))
+
+
+def _add_fetch(add: Callable[..., object]) -> None:
+    add("what", choices=("lpips",), help="lpips: backbone and linear heads")
+    text = "vgg (553 MB; the default) or alex (244 MB)"
+    add("--net", choices=("vgg", "alex"), default="vgg", help=text)
+
+
+def _fetch(what: str, net: Literal["vgg", "alex"]) -> None:
+    from pipeline.metrics.lpips import fetch_weights
+
+    _print(fetch_weights(net))
 
 
 def _add_doctor(add: Callable[..., object]) -> None:

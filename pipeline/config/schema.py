@@ -336,7 +336,9 @@ class Evaluate(Section):
     """Test views compared with renders."""
 
     lpips_net: Literal["vgg", "alex", "none"] = Field(
-        "vgg", description="Network of LPIPS. Its weights are searched locally, never downloaded."
+        "vgg",
+        description="Network of LPIPS, measured if `splatmake fetch lpips` has downloaded its "
+        "weights.",
     )
 
 

@@ -271,9 +271,10 @@ def _lpips() -> Finding:
 
 
 def _programs() -> list[Finding]:
-    if path := shutil.which("ffmpeg"):
+    path = shutil.which("ffmpeg")
+    if path and " libx264 " in _output([path, "-hide_banner", "-encoders"]):
         return [Finding("ffmpeg", f"{path}: videos in H.264")]
-    fix = "install ffmpeg for videos that all players support"
+    fix = "install ffmpeg with libx264 for videos that all players support"
     return [Finding("ffmpeg", "not found: videos in VP9", "absent", fix)]
 
 

@@ -19,9 +19,12 @@ Frames = Iterable[NDArray[np.uint8]]
 H264 = "H.264"
 VP9 = "VP9; with ffmpeg on the PATH it is H.264, which more programs play"
 
-# The primaries and curve of sRGB, in the matrix and range that players assume for video.
-_COLORS = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709"
-_COLOR_TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1")
+# The matrix and range that players assume for videos of today. A browser takes the matrix of an
+# older standard if not all three tags are there.
+_COLORS = (
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1"
+)
 
 
 def find_h264() -> str | None:
@@ -61,7 +64,7 @@ def _ffmpeg(program: str, path: Path, frames: Frames, size: tuple[int, int], fps
     command = [
         *(program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
         *("-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-", "-an", "-vf", _COLORS),
-        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-threads", "1", *_COLOR_TAGS),
+        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-threads", "1"),
         *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-movflags", "+faststart", str(path)),
     ]
     with TemporaryFile() as messages:

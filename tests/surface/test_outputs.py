@@ -150,6 +150,9 @@ def test_a_video_shows_the_path_upright_in_order_at_the_size_and_rate_asked_for(
     one, two = (tmp_path / out / "video.mp4" for out in ("one", "two"))
     assert one.read_bytes() == two.read_bytes()
     assert sorted(p.name for p in one.parent.iterdir()) == ["path.json", "video.mp4"]
+    if encoder == video.H264:
+        tags = b"colrnclx" + bytes((0, 1, 0, 13, 0, 1))
+        assert tags in one.read_bytes(), "browsers show other colours"
     facts = read_video_facts(one)
     assert (facts.width, facts.height, facts.frames, facts.fps) == (96, 96, 12, 8)
     capture = cv2.VideoCapture(str(one))

@@ -13,11 +13,13 @@ class ViewQuality:
 
     Attributes:
         psnr: The PSNR in dB over the pixels that the mask leaves.
+        flip: The mean FLIP error, 0 to 1; lower is better.
         lpips: The LPIPS, or None if its weights are not installed.
     """
 
     psnr: float
     ssim: float
+    flip: float | None
     lpips: float | None
 
     def __repr__(self) -> str:
@@ -32,7 +34,8 @@ class Quality:
     of a single view, in ``views``, may differ from it by several dB.
 
     Attributes:
-        psnr, ssim, lpips: The means over the views. LPIPS is None if its weights are not installed.
+        psnr, ssim, flip, lpips: The means over the views. LPIPS is None if its weights are not
+            installed.
         views: The quality of each view by its name.
         measured: Which views were measured: "test views", "training views" if the scene has no test
             views, or "chosen views".
@@ -45,6 +48,7 @@ class Quality:
 
     psnr: float
     ssim: float
+    flip: float | None
     lpips: float | None
     views: dict[str, ViewQuality]
     measured: str
@@ -69,8 +73,12 @@ def quality_of(found: Evaluation, measured: str) -> Quality:
     return Quality(
         psnr=found.psnr,
         ssim=found.ssim,
+        flip=found.flip,
         lpips=found.lpips,
-        views={view.name: ViewQuality(view.psnr, view.ssim, view.lpips) for view in found.per_view},
+        views={
+            view.name: ViewQuality(view.psnr, view.ssim, view.flip, view.lpips)
+            for view in found.per_view
+        },
         measured=measured,
         psnr_without_gains=found.psnr_without_gains,
         psnr_without_fit=found.psnr_without_fit,
@@ -79,4 +87,5 @@ def quality_of(found: Evaluation, measured: str) -> Quality:
 
 def _values(quality: ViewQuality | Quality) -> str:
     lpips = "" if quality.lpips is None else f", LPIPS {quality.lpips:.4f}"
-    return f"PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}{lpips}"
+    flip = "" if quality.flip is None else f", FLIP {quality.flip:.4f}"
+    return f"PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}{flip}{lpips}"

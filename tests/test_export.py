@@ -14,6 +14,7 @@ from PIL import Image
 
 from pipeline.config.schema import RENDERED_FORMATS, ExportFormat
 from pipeline.config.settled import Config
+from pipeline.config.video import VideoExport
 from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
@@ -228,7 +229,8 @@ def test_gaussians_are_exported_in_the_given_unit_near_the_origin(far_scene):
 
 
 def test_rendered_formats_are_written_on_demand(scene):
-    out, job = export(scene, formats=["renders", "depths", "mesh", "video"])
+    video = VideoExport(seconds=1).model_dump()
+    out, job = export(scene, formats=["renders", "depths", "mesh", "video"], video=video)
     assert len(list((out / "renders").glob("*.png"))) == 9
     assert len(list((out / "depths" / "median").iterdir())) == 9
     assert (out / "path.json").is_file()

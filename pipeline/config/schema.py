@@ -28,6 +28,7 @@ from pipeline.config.section import (
     Steps,
     Unit,
 )
+from pipeline.config.video import VideoExport
 
 #: The largest number of blocks. Each is a job that depends on all others, and Snakemake's time to
 #: plan them grows with the square of their number.
@@ -337,7 +338,9 @@ class Evaluate(Section):
     """Test views compared with renders."""
 
     lpips_net: Literal["vgg", "alex", "none"] = Field(
-        "vgg", description="Network of LPIPS. Its weights are searched locally, never downloaded."
+        "vgg",
+        description="Network of LPIPS, measured if `splatmake fetch lpips` has downloaded its "
+        "weights.",
     )
 
 
@@ -394,6 +397,7 @@ class Export(Section):
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "
         "would take over 24 million voxels.",
     )
+    video: VideoExport = Field(default_factory=VideoExport)
 
 
 class Config(Section):

@@ -255,12 +255,11 @@ def _write_rendered_formats(
 
     messages = write_rendered(
         out,
-        config.formats,
+        config,
         Gaussians.sharing(scene.trained),
         scene.training_size_views,
         choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),
-        mesh_voxel=config.mesh_voxel,
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

@@ -12,6 +12,7 @@ class EvaluateCounters(StageCounters):
 
     psnr: float = Field(description="Mean PSNR, dB.")
     ssim: float = Field(description="Mean SSIM; 1 for equal images.")
+    flip: float = Field(description="Mean FLIP; 0 for equal images, at most 1.")
     lpips: float | None = Field(
         description="Mean LPIPS; 0 for equal images, null where it was not measured."
     )

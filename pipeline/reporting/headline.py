@@ -17,13 +17,17 @@ from pipeline.runtime.text import counted, duration, shortened
 
 def headline(metrics: Metrics) -> str:
     """One line: quality, number of Gaussians, poses, warnings."""
-    lpips = "" if metrics.lpips is None else f", LPIPS {metrics.lpips:.3f}"
+    perceptual = "".join(
+        f", {name} {value:.3f}"
+        for name, value in (("FLIP", metrics.flip), ("LPIPS", metrics.lpips))
+        if value is not None
+    )
     pose = metrics.pose_error
     known = pose is not None and pose.rotation_median_deg is not None
     error = f", rotation error {pose.rotation_median_deg:.3f} degrees" if pose and known else ""
     warned = f", {counted(len(metrics.warnings), 'warning')}" if metrics.warnings else ""
     return (
-        f"PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}{lpips}, "
+        f"PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}{perceptual}, "
         f"{counted(metrics.num_gaussians, 'Gaussian')}, "
         f"{metrics.registered_images} of {metrics.total_images} photographs{error}{warned}"
     )

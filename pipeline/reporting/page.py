@@ -188,6 +188,7 @@ def _measures(metrics: TimedMetrics) -> list[Measure]:
     for name, heading, digits in (
         ("psnr", "PSNR, dB", 2),
         ("ssim", "SSIM", 4),
+        ("flip", "FLIP", 4),
         ("lpips", "LPIPS", 4),
     ):
         values = [getattr(view, name) for view in metrics.per_view]

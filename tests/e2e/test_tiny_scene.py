@@ -55,7 +55,8 @@ def test_photographs_become_a_scene(finished):
     assert found["psnr"] > 20
     assert 0.5 < found["ssim"] <= 1
     assert found["lpips"] is None
-    assert "checkpoints" in found["lpips_reason"]
+    assert "splatmake fetch lpips" in found["lpips_reason"]
+    assert 0 < found["flip"] < 0.3
     assert found["stages"]["decode"]["skipped"]
     assert not found["stages"]["train"]["skipped"]
     Metrics.model_validate(found)

@@ -139,10 +139,11 @@ def coverage() -> CoverageSection:
 
 def evaluation(*views: ViewMetrics) -> Evaluation:
     """With the measures of these views; of one, without arguments."""
-    one = ViewMetrics(name="a.jpg", psnr=27.5, ssim=0.9, lpips=None, render="0.png")
+    one = ViewMetrics(name="a.jpg", psnr=27.5, ssim=0.9, flip=0.08, lpips=None, render="0.png")
     return Evaluation(
         psnr=27.5,
         ssim=0.9,
+        flip=0.08,
         lpips=None,
         lpips_reason="switched off",
         train_psnr=30.0,
@@ -181,6 +182,7 @@ def metrics(**changes) -> TimedMetrics:
         "device": "cpu",
         "psnr": 27.3456,
         "ssim": 0.87654,
+        "flip": 0.08765,
         "lpips": 0.12347,
         "lpips_reason": "",
         "num_gaussians": 123456,

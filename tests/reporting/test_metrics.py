@@ -116,7 +116,7 @@ def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
 
 
 def test_the_result_has_grade_quality_size_poses_time_and_paths(folder):
-    line = "PSNR 27.50 dB, SSIM 0.9000, 1,000 Gaussians, 6 of 8 photographs, 2 warnings"
+    line = "PSNR 27.50 dB, SSIM 0.9000, FLIP 0.080, 1,000 Gaussians, 6 of 8 photographs, 2 warnings"
     assert headline(read_metrics(folder)) == line
     assert finished_line(folder) == f"barn: weak, {line}, 14 s"
     coverage().record.write(folder / "coverage")

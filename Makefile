@@ -75,7 +75,6 @@ data/demo/demo.json: | extension
 # Fewer steps than the preset's: the demo is small, and shall be there within minutes.
 demo: extension data/demo/demo.json
 	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json --config 'train={"steps": 1500}'
-	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
 
 # More than two cores' worth: tests that run Snakemake start many programs, one after the other.
 WORKERS := 3
@@ -146,7 +145,8 @@ lock:
 VIEWER := pipeline/reporting/viewer
 viewer:
 	@mkdir -p build/viewer
-	@cp $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/viewer.js build/viewer
+	@rm -rf build/viewer/src
+	@cp -r $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/src build/viewer
 	@cd build/viewer && npm ci --ignore-scripts && npm run build
 	@cp build/viewer/viewer.min.js $(VIEWER)
 

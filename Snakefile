@@ -6,20 +6,19 @@ import sys
 
 sys.path.insert(0, workflow.basedir)
 
-from stages.workflow.internals import shorten_failures
+from stages.workflow.display import show_run
 from stages.workflow.project import SnakemakeProject, check_config
 
-shorten_failures()
-
+display = show_run(workflow)
 if os.path.exists("config/config.yaml"):
     check_config("config/config.yaml")
 
     configfile: "config/config.yaml"
 
 
-project = SnakemakeProject(config, workflow)
+project = SnakemakeProject(config, workflow, display)
 RUN = (
-    "python -m stages {rule} --out {params.out:q} --key {params.key:q}"
+    "exec python -m stages {rule} --out {params.out:q} --key {params.key:q}"
     " --input {params.inputs:q} --publish {params.publish:q} --threads {threads}"
     " --memory-mb {resources.mem_mb} --log {log:q}"
 )
@@ -27,6 +26,10 @@ RUN = (
 
 onstart:
     project.before_jobs()
+
+
+onsuccess:
+    project.after_success()
 
 
 onerror:

@@ -316,6 +316,13 @@ MUTANTS: dict[str, Mutant] = {
         "SPZ's scales cut off instead of rounded",
         ("tests/io/test_spz.py",),
     ),
+    "spz_axes": Mutant(
+        "pipeline/splats/axes.py",
+        "(degree - m) % 2 == 1)",
+        "m % 2 == 1)",
+        "another program's axes with the wrong signs of spherical harmonics",
+        ("tests/splats/test_axes.py",),
+    ),
     "ssim_bands": Mutant(
         "pipeline/metrics/image.py",
         "first = max(rows.start - _RADIUS, 0)",

@@ -88,6 +88,7 @@ def _run(folder: Path) -> dict[str, Any]:
         "seed": metrics["seed"],
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
+        "flip": metrics.get("flip"),
         "lpips": metrics["lpips"],
         "train_psnr": metrics["train_psnr"],
         "gaussians": metrics["num_gaussians"],

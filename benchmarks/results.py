@@ -298,7 +298,7 @@ class BudgetResult:
         options: The configuration besides the time.
         minutes: The time budget of training.
         steps: The number of optimiser steps.
-        psnr, ssim, lpips: The means over the test views; ``lpips`` is None if it was not measured.
+        psnr, ssim, flip, lpips: The means over the test views; None if not measured.
         wall_minutes, cpu_minutes: The measured time of training.
         other_cpu_minutes: The CPU time of the stages before training.
         threads: The number of threads of training.
@@ -323,6 +323,7 @@ class BudgetResult:
     load_average: float | None
     test_views: int
     pixels: str
+    flip: float | None = None
 
 
 # ---- benchmarks.pose_conventions ----

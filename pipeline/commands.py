@@ -60,12 +60,14 @@ def convert(
     sh_degree: int,
     min_opacity: float,
     morton_order: bool,
+    spz_version: int,
     warnings: list[str],
 ) -> list[str]:
     """Convert a file of Gaussians to the format of ``target``'s suffix.
 
     Args:
         sh_degree, min_opacity, morton_order: The arguments of ``splats.reduce.reduce_gaussians``.
+        spz_version: The version of an SPZ file that is written, 3 or 4.
         warnings: The list that warnings are added to, also of what ``target`` does not hold.
 
     Returns:
@@ -77,7 +79,8 @@ def convert(
     check_suffix(target)
     found = read_gaussians(source, warnings)
     made = reduce_gaussians(found.as_arrays(), sh_degree, min_opacity, morton_order)
-    warnings += write_gaussians(target, made, antialias=is_antialiased(source))
+    antialias = is_antialiased(source)
+    warnings += write_gaussians(target, made, antialias=antialias, spz_version=spz_version)
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"
     return [f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]

@@ -260,20 +260,20 @@ def _lpips() -> Finding:
     topic = "LPIPS weights"
     if any(find_spec(name) is None for name in ("numpy", "torch")):
         return Finding(topic, "need torch", "absent")
-    from pipeline.metrics.lpips import lpips_available, weights_found
+    from pipeline.metrics.lpips import FETCH, weights_found
 
     found = {net: len(weights_found(net)) for net in ("vgg", "alex")}
     whole = [net for net, files in found.items() if files == 2]
     if whole:
         return Finding(topic, ", ".join(whole))
-    fix = lpips_available("vgg")[1].removeprefix("weights not found: ")
-    return Finding(topic, "not found: metrics.json has no LPIPS", "absent", fix)
+    return Finding(topic, "not found: metrics.json has no LPIPS", "absent", FETCH["vgg"])
 
 
 def _programs() -> list[Finding]:
-    if path := shutil.which("ffmpeg"):
+    path = shutil.which("ffmpeg")
+    if path and " libx264 " in _output([path, "-hide_banner", "-encoders"]):
         return [Finding("ffmpeg", f"{path}: videos in H.264")]
-    fix = "install ffmpeg for videos that all players support"
+    fix = "install ffmpeg with libx264 for videos that all players support"
     return [Finding("ffmpeg", "not found: videos in VP9", "absent", fix)]
 
 

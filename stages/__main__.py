@@ -8,14 +8,17 @@ import json
 import sys
 from pathlib import Path
 
-from pipeline.runtime.errors import EXIT_INTERRUPTED
-from pipeline.runtime.job import Request, run_stage
-from pipeline.runtime.machine import usable_cores
-from pipeline.runtime.memory import share_heap
-from stages.workflow.cluster import OVERHEAD_MB, granted_cpus
+# The shell's convention: 128 and the number of the signal, SIGINT.
+EXIT_INTERRUPTED = 130
 
 
 def main() -> int:
+    # Imported here, so that Ctrl-C meanwhile ends without a traceback.
+    from pipeline.runtime.job import Request, run_stage
+    from pipeline.runtime.machine import usable_cores
+    from pipeline.runtime.memory import share_heap
+    from stages.workflow.cluster import OVERHEAD_MB, granted_cpus
+
     parser = argparse.ArgumentParser("stages", description=__doc__)
     parser.add_argument("stage", help="name of the stage")
     parser.add_argument("--out", type=Path, required=True, help="the stage's folder")

@@ -22,6 +22,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.coverage.measure import measure_coverage, world_frame
+    from pipeline.coverage.record import CoverageRecord
     from pipeline.metrics.evaluation import Evaluation
     from pipeline.metrics.protocol import choose_protocol
     from pipeline.render.registry import use_device
@@ -39,6 +40,7 @@ def work(job: Job) -> None:
         job.inputs["evaluate"] / "renders",
         world_frame(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
     )
+    job.decide(CoverageRecord.read(job.out).headline())
 
 
 SPEC = StageSpec(

@@ -74,7 +74,9 @@ def work(job: Job) -> None:
         evaluation = evaluation.model_copy(update={"pose_error": error})
     evaluation.write(job.out)
     job.counters = EvaluateCounters.model_validate(evaluation, from_attributes=True)
-    job.decide(f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}")
+    job.decide(
+        f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}, FLIP {evaluation.flip:.4f}"
+    )
     if not protocol.has_test_views:
         job.warn("there are no test views: quality was measured on training views")
 

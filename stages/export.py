@@ -8,7 +8,7 @@ Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.splat``, ``.g
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Views
@@ -17,7 +17,7 @@ from pipeline.config.settled import Train
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -72,6 +72,14 @@ def work(job: Job) -> None:
     job.record(report.counters, report.decisions, report.warnings)
 
 
+def facts(plan: Plan) -> dict[str, Any]:
+    if "video" not in plan.config.export.formats:
+        return {}
+    from pipeline.surface.video import find_h264
+
+    return {"h264": find_h264() is not None}
+
+
 SPEC = StageSpec(
     name="export",
     work=work,
@@ -85,5 +93,13 @@ SPEC = StageSpec(
     },
     optional=("partition",),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
-    packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
+    facts=facts,
+    packages=(
+        "torch",
+        "numpy",
+        "zstandard",
+        "scipy",
+        "scikit-image",
+        "opencv-contrib-python-headless",
+    ),
 )

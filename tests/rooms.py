@@ -34,7 +34,7 @@ ROOMS = {
     "training.loop": "the optimisation, step by step",
     "training.scene": "entry point: trains a scene and reports on it",
     "training.blocks": "division of large scenes into blocks",
-    "metrics": "PSNR, SSIM, LPIPS, protocols, pose errors",
+    "metrics": "PSNR, SSIM, FLIP, LPIPS, protocols, pose errors",
     "coverage": "what the photographs did not see",
     "surface": "meshes",
     "export": "files for other programs",

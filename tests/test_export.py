@@ -14,6 +14,7 @@ from PIL import Image
 
 from pipeline.config.schema import RENDERED_FORMATS, ExportFormat
 from pipeline.config.settled import Config
+from pipeline.config.video import VideoExport
 from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
@@ -113,7 +114,8 @@ def test_every_format_the_schema_offers_is_written(scene):
     )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
     assert job.counters == ExportCounters(exported_gaussians=len(kept))
-    for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
+    files = ((".ply", 1), (".spz", 1), ("_v4.spz", 1), (".glb", 1), (".splat", 0))
+    for suffix, degree in files:
         found = read_gaussians(out / f"point_cloud{suffix}", [])
         assert len(found) == len(kept) and found.sh_degree == degree
         np.testing.assert_allclose(found.means, kept.means, atol=1e-5)
@@ -227,7 +229,8 @@ def test_gaussians_are_exported_in_the_given_unit_near_the_origin(far_scene):
 
 
 def test_rendered_formats_are_written_on_demand(scene):
-    out, job = export(scene, formats=["renders", "depths", "mesh", "video"])
+    video = VideoExport(seconds=1).model_dump()
+    out, job = export(scene, formats=["renders", "depths", "mesh", "video"], video=video)
     assert len(list((out / "renders").glob("*.png"))) == 9
     assert len(list((out / "depths" / "median").iterdir())) == 9
     assert (out / "path.json").is_file()
@@ -264,14 +267,15 @@ def test_transforms_omit_an_empty_point_cloud(scene):
 
 
 def test_frame_json_describes_the_coordinate_frame(scene):
-    out, _ = export(scene, formats=["ply", "gltf"])
+    out, _ = export(scene, formats=["ply", "spz", "spz4", "gltf", "splat"])
     found = json.loads((out / "frame.json").read_text())
     assert found["up"] == [0, -1, 0]
     assert found["cameras"]["centre"] == [-4, 0, -4]
     assert found["gaussians"] == {"count": 50, "sh_degree": 3}
     # Trained on random backgrounds, shown on white.
     assert found["render"]["background"] == [1, 1, 1]
-    assert list(found["axes_of"]) == ["point_cloud.glb"]
+    turned = {f"point_cloud{end}" for end in (".spz", "_v4.spz", ".glb")}
+    assert found["axes_of"].keys() == turned
 
 
 def test_default_formats(scene):

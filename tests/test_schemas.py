@@ -49,7 +49,7 @@ FILES: list[JsonFile] = [
     GPS,
     describe_frame(gaussians(), ring(), np.array([0.0, 0, 1]), RENDER, ["point_cloud.glb"], GPS),
     describe_frame(gaussians(), ring(), np.array([0.0, 0, 1]), RENDER, [], None),
-    describe_path(ring()),
+    describe_path(ring(), 30),
     *([GIVEN] if GIVEN is not None else []),
 ]
 

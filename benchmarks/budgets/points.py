@@ -105,6 +105,7 @@ def measured_point(setup: Setup, scene: str, seed: int, minutes: float) -> Budge
         steps=read_stage(results / "train").counters["steps"],
         psnr=evaluation.psnr,
         ssim=evaluation.ssim,
+        flip=evaluation.flip,
         lpips=evaluation.lpips,
         gaussians=evaluation.model.num_gaussians,
         wall_minutes=trained["wall_s"] / 60,

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.command import parser as types
 from pipeline.command.parser import Parser
@@ -115,13 +115,13 @@ def make_parser(program: str = "splatmake") -> Parser:
         "updated twice a minute."
     )
     _add_view(command("view", _view, text, "results/garden", about))
-    text = "convert Gaussians to another format, optionally with fewer coefficients"
+    text = "convert Gaussians to another file format"
     example = "point_cloud.ply garden.spz --min-opacity 0.02"
     _add_convert(command("convert", _convert, text, example))
     example = "garden.spz --cameras results/garden -o renders"
     _add_render(command("render", _render, "render Gaussians from given cameras, to PNG", example))
-    text = "PSNR and SSIM of Gaussians against a scene's photographs"
-    about = "PSNR and SSIM of each test view against its photograph, and their means."
+    text = "PSNR, SSIM and FLIP of Gaussians against a scene's photographs"
+    about = "PSNR, SSIM and FLIP of each test view against its photograph, and their means."
     example = "point_cloud.ply --scene results/garden"
     _add_evaluate(command("evaluate", _evaluate, text, example, about))
     text = "tables of a batch, or of two"
@@ -139,6 +139,9 @@ def make_parser(program: str = "splatmake") -> Parser:
     add = command("options", _options, text, "train.steps", about)
     text = "option or section, such as train.steps or train"
     add("names", nargs="*", metavar="NAME", help=text)
+    text = "download the weights of LPIPS"
+    about = "Download the weights of LPIPS into torch's folder ($TORCH_HOME or ~/.cache/torch)."
+    _add_fetch(command("fetch", _fetch, text, "lpips", about))
     text = "show what this machine has, what is used, and what is missing"
     about = (
         "Report processor, compilers, memory, graphics cards, packages and disk (+ used, - "
@@ -161,6 +164,8 @@ def _add_convert(add: Callable[..., object]) -> None:
     add("--min-opacity", type=types.share, default=0.0, metavar="SHARE", help=text)
     text = "sort along a Z-order curve: smaller files"
     add("--morton-order", action="store_true", help=text)
+    text = "version of an .spz file (default 3, which more programs read)"
+    add("--spz-version", type=int, choices=(3, 4), default=3, help=text)
 
 
 def _convert(**options: Any) -> None:
@@ -213,12 +218,12 @@ def _evaluate(**options: Any) -> None:
     found = evaluate(**options, how=how)
     width = max(len(view.name) for view in found.per_view)
     lines = [
-        f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}"
+        f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}  FLIP {view.flip:.4f}"
         for view in found.per_view
     ]
     protocol = found.protocol
     lpips = "" if found.lpips is None else f", LPIPS {found.lpips:.4f}"
-    means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}{lpips}"
+    means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, FLIP {found.flip:.4f}{lpips}"
     lines.append(f"{means}, {protocol.num_views} views")
     lines.append(f"({protocol.split}; {', '.join(protocol.resolution)} pixels)")
     _print(lines, found.warnings)
@@ -315,6 +320,18 @@ def _tensorboard(**options: Any) -> None:
     from pipeline.watching.tensorboard import write_events
 
     _print(write_events(**options))
+
+
+def _add_fetch(add: Callable[..., object]) -> None:
+    add("what", choices=("lpips",), help="lpips: backbone and linear heads")
+    text = "vgg (553 MB; the default) or alex (244 MB)"
+    add("--net", choices=("vgg", "alex"), default="vgg", help=text)
+
+
+def _fetch(what: str, net: Literal["vgg", "alex"]) -> None:
+    from pipeline.metrics.lpips import fetch_weights
+
+    _print(fetch_weights(net))
 
 
 def _add_doctor(add: Callable[..., object]) -> None:

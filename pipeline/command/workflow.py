@@ -17,7 +17,7 @@ from pipeline.config.config_file import check_config_file
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import name_fault
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.layout import COMMAND, WORKFLOW, install_extra
+from pipeline.runtime.layout import COMMAND, PACKAGES, WORKFLOW, install_extra
 from pipeline.runtime.suggest import did_you_mean, nearest, nearest_path
 
 _SLURM = "snakemake_executor_plugin_slurm"
@@ -208,7 +208,7 @@ def _snakemake(
         config += as_snakemake_reads(how.config)
     profile = None if how.profile is None else _profile(how.profile)
     return [
-        *(sys.executable, "-m", "snakemake"),
+        *(sys.executable, str(PACKAGES / "stages" / "workflow" / "__main__.py")),
         *targets,
         *("--snakefile", str(WORKFLOW / "Snakefile"), "--cores", how.cores),
         *(() if how.out is None else ("--directory", os.path.abspath(how.out))),

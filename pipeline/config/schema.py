@@ -28,6 +28,7 @@ from pipeline.config.section import (
     Steps,
     Unit,
 )
+from pipeline.config.video import VideoExport
 
 #: The largest number of blocks. Each is a job that depends on all others, and Snakemake's time to
 #: plan them grows with the square of their number.
@@ -337,7 +338,9 @@ class Evaluate(Section):
     """Test views compared with renders."""
 
     lpips_net: Literal["vgg", "alex", "none"] = Field(
-        "vgg", description="Network of LPIPS. Its weights are searched locally, never downloaded."
+        "vgg",
+        description="Network of LPIPS, measured if `splatmake fetch lpips` has downloaded its "
+        "weights.",
     )
 
 
@@ -349,6 +352,7 @@ ExportFormat = Literal[
     "ply",
     "blocks",
     "spz",
+    "spz4",
     "splat",
     "gltf",
     "points",
@@ -377,7 +381,8 @@ class Export(Section):
     formats: ExportFormats = Field(
         ("ply", "spz", "points", "colmap", "transforms"),
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
-        "scene), spz (a sixth of the size), splat (without SH), gltf (.glb with "
+        "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
+        "read, for up to 30 million Gaussians instead of 10), splat (without SH), gltf (.glb with "
         "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
@@ -392,6 +397,7 @@ class Export(Section):
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "
         "would take over 24 million voxels.",
     )
+    video: VideoExport = Field(default_factory=VideoExport)
 
 
 class Config(Section):

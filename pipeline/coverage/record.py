@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix4, Vector3
+from pipeline.runtime.text import counted
 
 RENDER = "File of the render, relative to the stage's folder"
 TRUST_MAP = "File of the trust of each pixel: grey, 0 to 255 for 0 to 1"
@@ -136,3 +137,11 @@ class CoverageRecord(JsonFile, JsonObject):
     viewpoints: tuple[ProposedViewpoint, ...] = Field(
         (), description="In the order in which they raise trust most."
     )
+
+    def headline(self) -> str:
+        """What was found, in a few words for the terminal."""
+        if self.surface is None:
+            return self.reason
+        once = self.surface.seen_by.one
+        places = counted(len(self.viewpoints), "place")
+        return f"{once:.0%} of the surface in one photograph only; {places} to photograph next"

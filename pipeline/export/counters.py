@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class ExportCounters(StageCounters):
@@ -13,3 +14,6 @@ class ExportCounters(StageCounters):
     exported_gaussians: int = Field(
         ge=0, description="Number of Gaussians in each exported file, after `export.min_opacity`."
     )
+
+    def headline(self) -> str:
+        return counted(self.exported_gaussians, "Gaussian")

@@ -36,7 +36,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
 # The formats of one file with the Gaussians.
-GAUSSIAN_FORMATS = ("ply", "spz", "splat", "gltf")
+GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "splat", "gltf")
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,9 @@ class _Files:
         """Whether the given world has another origin than the scene's."""
         return bool(self.scene.normalization.origin.any())
 
+    def write_spz(self, path: Path, version: int) -> None:
+        write_spz(path, self.gaussians, antialias=self.antialias, version=version)
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -144,7 +147,8 @@ class _Files:
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
     "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
-    "spz": ("point_cloud.spz", lambda path, f: write_spz(path, f.gaussians, antialias=f.antialias)),
+    "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
+    "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),
@@ -251,12 +255,11 @@ def _write_rendered_formats(
 
     messages = write_rendered(
         out,
-        config.formats,
+        config,
         Gaussians.sharing(scene.trained),
         scene.training_size_views,
         choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),
-        mesh_voxel=config.mesh_voxel,
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

@@ -19,7 +19,10 @@ AXES = (
     "right-handed, COLMAP's convention: in a camera at the identity, x is right, y is down and z "
     "is forward"
 )
+_SPZ = "rotated by 180 degrees about x (y and z negated), because SPZ is right, up, back"
 OTHER_AXES = {
+    "point_cloud.spz": _SPZ,
+    "point_cloud_v4.spz": _SPZ,
     "point_cloud.glb": "rotated by 180 degrees about z (x and y negated), because glTF is y up",
     "transforms.json": "camera axes are OpenGL's (x right, y up, z backward)",
 }

@@ -1,8 +1,8 @@
 """Binary glTF (.glb) with the extension KHR_gaussian_splatting: Gaussians as point primitives.
 
-Programs without support for the extension show a coloured point cloud. glTF is y up with its front
-towards +z, so the PLY's frame (y down, z forward) is rotated by 180 degrees about z, as other
-programs do. Source: github.com/KhronosGroup/glTF, KHR_gaussian_splatting, README.md.
+Programs without support for the extension show a coloured point cloud. glTF's axes are left, up,
+forward: the world rotated by 180 degrees about z. Source: github.com/KhronosGroup/glTF,
+KHR_gaussian_splatting, README.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from pipeline.io.bounded import read_bounded
 from pipeline.io.splat_codec import FIX, logit, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
-from pipeline.splats.arrays import Array, GaussianArrays, GaussianSource
+from pipeline.splats.arrays import Array, GaussianSource
+from pipeline.splats.axes import LUF, Flipped, flip
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.splats.init import SH_C0
 
@@ -51,6 +52,7 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
             file=path,
             fix="change export.min_opacity to export more or fewer of the faint Gaussians",
         )
+    gaussians = Flipped(gaussians, LUF)
     columns = _columns(gaussians.sh_degree)
     accessors: list[dict[str, Any]] = []
     for column in columns:
@@ -64,10 +66,7 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
         )
         if column.is_bytes:
             accessors[-1]["normalized"] = True
-    bounds = [
-        np.stack([chunk.min(0), chunk.max(0)])
-        for chunk in (half_turned_means(means) for (means,) in gaussians.chunks("means"))
-    ]
+    bounds = [np.stack([means.min(0), means.max(0)]) for (means,) in gaussians.chunks("means")]
     low, high = np.min(bounds, 0)[0], np.max(bounds, 0)[1]
     accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
     sizes = [count * column.width * (1 if column.is_bytes else 4) for column in columns]
@@ -120,22 +119,21 @@ class _Column(NamedTuple):
 
 
 def _columns(sh_degree: int) -> list[_Column]:
-    """The attributes, half-turned."""
+    """The attributes of Gaussians in glTF's axes."""
 
     def colour(sh: Array, logits: Array) -> NDArray[np.uint8]:
         return to_uint8(np.concatenate([0.5 + SH_C0 * sh[:, 0], sigmoid(logits)[:, None]], 1) * 255)
 
     def rotation(quats: Array) -> NDArray[Any]:
-        turned = half_turned_quats(quats)
-        norm = np.linalg.norm(turned, axis=1, keepdims=True)
-        unit = np.where(norm > 0, turned / np.maximum(norm, 1e-30), (1, 0, 0, 0))
+        norm = np.linalg.norm(quats, axis=1, keepdims=True)
+        unit = np.where(norm > 0, quats / np.maximum(norm, 1e-30), (1, 0, 0, 0))
         return unit[:, [1, 2, 3, 0]]
 
     def coefficient(k: int) -> Callable[[Array], Array]:
-        return lambda sh: -sh[:, k] if k % 2 else sh[:, k]
+        return lambda sh: sh[:, k]
 
     return [
-        _Column("POSITION", 3, ("means",), half_turned_means),
+        _Column("POSITION", 3, ("means",), lambda means: means),
         _Column("COLOR_0", 4, ("sh", "opacity_logits"), colour, is_bytes=True),
         _Column(f"{_NAME}:ROTATION", 4, ("quats",), rotation),
         _Column(f"{_NAME}:SCALE", 3, ("log_scales",), np.exp),
@@ -148,7 +146,7 @@ def _columns(sh_degree: int) -> list[_Column]:
 
 
 def read_gltf(path: Path) -> Gaussians:
-    """Read the Gaussians of all primitives of a .glb file, in the PLY's frame.
+    """Read the Gaussians of all primitives of a .glb file, in the world's axes.
 
     Raises:
         UserError: the file is missing, truncated or malformed, has no Gaussians, or has
@@ -177,7 +175,7 @@ def read_gltf(path: Path) -> Gaussians:
     except ValueError as error:
         raise UserError(str(error), file=path, fix=_FIX) from None
     degree = max(part.sh_degree for part in parts)
-    return half_turn(concat([part.with_sh_degree(degree) for part in parts]))
+    return concat([part.with_sh_degree(degree) for part in parts])
 
 
 class _View(BaseModel):
@@ -282,7 +280,7 @@ def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]
     coefficients = [column(f"{_NAME}:{name}", 3) for name in names]
     if any(len(values) != len(scale) for values in (*arrays.values(), *coefficients)):
         raise ValueError("expected attributes of one length, found several")
-    return Gaussians.from_arrays(arrays | {"sh": np.stack(coefficients, 1)})
+    return Gaussians.from_arrays(flip(arrays | {"sh": np.stack(coefficients, 1)}, LUF))
 
 
 def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.float32]:
@@ -311,29 +309,3 @@ def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.flo
     if accessor.normalized and dtype.kind != "f":
         return np.maximum(table / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
     return table.astype(np.float32)
-
-
-# The rotation by 180 degrees about z, the inverse of itself: x and y change sign, as do the
-# harmonics of odd order, which are the coefficients of odd index. Quaternions are multiplied by k.
-
-
-def half_turned_means(means: Array) -> Array:
-    return means * np.array([-1, -1, 1], np.float32)
-
-
-def half_turned_quats(quats: Array) -> Array:
-    w, x, y, z = quats.T
-    return np.stack([-z, -y, x, w], 1)
-
-
-def half_turned_sh(sh: Array) -> Array:
-    signs = np.ones((sh.shape[1], 1), np.float32)
-    signs[1::2] = -1
-    return sh * signs
-
-
-def half_turn(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians rotated by 180 degrees about z."""
-    means, log_scales, quats, logits, sh = gaussians.arrays().values()
-    turned = half_turned_means(means), log_scales, half_turned_quats(quats), logits
-    return Gaussians.sharing(GaussianArrays(*turned, half_turned_sh(sh)))

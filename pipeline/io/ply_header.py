@@ -73,6 +73,12 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
                 pass
             case ["format", kind, "1.0"] if kind in _BYTE_ORDERS:
                 byte_order = _BYTE_ORDERS[kind]
+            case ["element", "chunk", _]:
+                raise UserError(
+                    "expected an ordinary PLY file, found SuperSplat's compressed one",
+                    file=path,
+                    fix="convert it to an ordinary PLY file, as with splat-transform",
+                )
             case ["element", name, count]:
                 elements.append((name, count))
             case ["property", kind, name] if kind in _TYPES and elements:

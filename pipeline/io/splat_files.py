@@ -76,11 +76,18 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     return gaussians
 
 
-def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = False) -> list[str]:
+def write_gaussians(
+    path: Path,
+    gaussians: GaussianSource,
+    *,
+    antialias: bool = False,
+    spz_version: int = 3,
+) -> list[str]:
     """Write Gaussians atomically, in the format of the suffix.
 
     Args:
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
+        spz_version: The version of an SPZ file, 3 or 4.
 
     Returns:
         A sentence for everything that the format does not hold (``splat_losses``).
@@ -90,7 +97,7 @@ def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = 
     """
     _, write = _format_of(path)
     if write is write_spz:
-        write_spz(path, gaussians, antialias=antialias)
+        write_spz(path, gaussians, antialias=antialias, version=spz_version)
     else:
         write(path, gaussians)
     return [*losses(path, gaussians), *(unmarked([path.name]) if antialias else [])]

@@ -1,40 +1,43 @@
-"""SPZ files: Niantic's compressed format for Gaussians.
+"""SPZ files: Niantic's compressed format for Gaussians, versions 1 to 4.
 
-One gzip stream: a header of 16 bytes, then one section per attribute with the values of all
-Gaussians. Coordinates are in the PLY's frame, as in programs that convert PLY to SPZ. Source of
-the layout: github.com/nianticlabs/spz, README.md. Quantisation errors:
-docs/reference/formats.md.
+Coordinates are in the format's own axes (right, up, back), and are converted from and to the
+world's. The containers are in ``spz_container``. Source of the encoding of the attributes:
+github.com/nianticlabs/spz, README.md. Quantisation errors: docs/reference/formats.md.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.bounded import opened_regular, read_bounded
+from pipeline.io.bounded import read_bounded
 from pipeline.io.splat_codec import FIX, logit_of_byte, sigmoid, to_uint8
+from pipeline.io.spz_container import (
+    ANTIALIASED,
+    HAS_EXTENSIONS,
+    HIGHER,
+    MAX_GAUSSIANS,
+    Header,
+    pack,
+    read_header,
+    unpack,
+)
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
+from pipeline.splats.axes import RUB, Flipped, flip
 from pipeline.splats.gaussians import Gaussians
 
 Doubles = NDArray[np.float64]
 
-_MAGIC = 0x5053474E  # "NGSP"
-_HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, 0
-_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 # Quantisation steps per unit of the DC coefficient, as in Niantic's encoder; 8 bits then cover
-# colours beyond [0, 1].
+# colours beyond [0, 1]. Higher coefficients are written with all 8 bits; other encoders keep 5 or 4
+# to compress better.
 _DC_STEPS = 0.15 * 255
-# SH coefficients above DC by degree; splatmake's end at 3. They are written with all 8
-# bits; other encoders keep 5 or 4 to compress better.
-_HIGHER = (0, 3, 8, 15, 24)
 # Positions have 24 bits; the maximum number of fractional bits.
 _MAX_FRACTION_BITS = 20
 # Gaussians farther from the origin than this many median distances are outliers: they are moved
@@ -43,16 +46,14 @@ _OUTLIER_DISTANCE = 512.0
 # The range of log scales: 8 bits in steps of 1/16.
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
 _QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller components are at most 1 / sqrt(2).
-# Limit of the expansion by gzip; measured values compress less.
-_MAX_EXPANSION = 200
-# The limit of Niantic's reader.
-MAX_GAUSSIANS = 10_000_000
-_FIX = "write the file again as SPZ version 3, or get an intact copy of it"
+_FIX = "write the file again as SPZ version 3 or 4, or get an intact copy of it"
 
 
-def write_spz(path: Path, gaussians: GaussianSource, *, antialias: bool = False) -> None:
+def write_spz(
+    path: Path, gaussians: GaussianSource, *, antialias: bool = False, version: int = 3
+) -> None:
     """Write an SPZ file atomically; see ``encode_spz``."""
-    write_pieces(path, _compressed(_sections(gaussians, antialias)))
+    write_pieces(path, _pieces(gaussians, antialias, version))
 
 
 def read_spz(path: Path) -> Gaussians:
@@ -67,71 +68,56 @@ def read_spz(path: Path) -> Gaussians:
 def read_antialias(path: Path) -> bool:
     """Whether an SPZ file records that the Gaussians were trained with opacity compensation; False
     for a file that cannot be read."""
-    found = _read_header(path)
-    return found is not None and bool(found.flags & _ANTIALIASED)
+    found = read_header(path)
+    return found is not None and bool(found.flags & ANTIALIASED)
 
 
 def ignored_content(path: Path) -> list[str]:
     """What ``read_spz`` leaves out of an SPZ file, in words."""
-    found, ignored = _read_header(path), []
-    if found is not None and found.degree == len(_HIGHER) - 1:
+    found, ignored = read_header(path), []
+    if found is not None and found.degree == len(HIGHER) - 1:
         ignored.append("spherical harmonics of degree 4 (3 is the highest that is rendered)")
-    if found is not None and found.flags & _HAS_EXTENSIONS:
-        ignored.append("extensions of the format")
+    if found is not None and found.flags & HAS_EXTENSIONS:
+        ignored.append("extensions of the format other than the axes")
     return ignored
 
 
-class _Header(NamedTuple):
-    """The part of an SPZ header that decides what is read."""
-
-    degree: int
-    flags: int
-
-
-def _read_header(path: Path) -> _Header | None:
-    """The header of an SPZ file; None for a file that cannot be read."""
-    try:
-        with opened_regular(path) as file:
-            start = file.read(4096)
-        head = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, _HEADER.size)
-        magic, _version, _count, degree, _bits, flags, _reserved = _HEADER.unpack(head)
-    except (OSError, zlib.error, struct.error):
-        return None
-    return _Header(degree, flags) if magic == _MAGIC else None
-
-
-def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:
-    """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
+def encode_spz(gaussians: GaussianSource, *, antialias: bool = False, version: int = 3) -> bytes:
+    """The bytes of an SPZ file; the same Gaussians always give the same bytes.
 
     Args:
+        gaussians: The Gaussians in the world's axes.
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation,
             with which viewers should render them.
+        version: The version of the format, 3 or 4.
 
     Raises:
-        UserError: There are more than ``MAX_GAUSSIANS``.
+        UserError: The version is another, or cannot hold so many Gaussians (``MAX_GAUSSIANS``).
     """
-    return b"".join(_compressed(_sections(gaussians, antialias)))
+    return b"".join(_pieces(gaussians, antialias, version))
 
 
-def _compressed(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """One gzip stream, without a time."""
-    stream = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
-    for piece in pieces:
-        yield stream.compress(piece)
-    yield stream.flush()
-
-
-def _sections(gaussians: GaussianSource, antialias: bool) -> Iterator[bytes]:
-    """The header and the sections, chunk by chunk."""
-    count = len(gaussians)
-    if count > MAX_GAUSSIANS:
+def _pieces(gaussians: GaussianSource, antialias: bool, version: int) -> Iterator[bytes]:
+    if version not in (3, 4):
         raise UserError(
-            f"an SPZ file can hold up to {MAX_GAUSSIANS} Gaussians, found {count}",
-            fix="export fewer of the faint Gaussians (export.min_opacity), or write a PLY",
+            f"expected SPZ version 3 or 4, found {version}", fix="write one of these versions"
+        )
+    count, limit = len(gaussians), MAX_GAUSSIANS[version]
+    if count > limit:
+        other = ", write version 4 (spz4 in export.formats)" if count <= MAX_GAUSSIANS[4] else ""
+        raise UserError(
+            f"an SPZ file of version {version} can hold up to {limit} Gaussians, found {count}",
+            fix=f"export fewer of the faint Gaussians (export.min_opacity){other}, or write a PLY",
         )
     bits = _fraction_bits(gaussians)
+    header = Header(version, count, gaussians.sh_degree, bits, ANTIALIASED * antialias)
+    return pack(header, _attributes(Flipped(gaussians, RUB), bits))
 
-    def section(encode: Callable[..., NDArray[np.uint8]], *names: str) -> Iterator[bytes]:
+
+def _attributes(gaussians: GaussianSource, bits: int) -> list[Iterator[bytes]]:
+    """The bytes of each attribute, chunk by chunk."""
+
+    def attribute(encode: Callable[..., NDArray[np.uint8]], *names: str) -> Iterator[bytes]:
         for chunk in gaussians.chunks(*names):
             yield encode(*(values.astype(np.float64) for values in chunk)).tobytes()
 
@@ -142,13 +128,14 @@ def _sections(gaussians: GaussianSource, antialias: bool) -> Iterator[bytes]:
     def scales(means: Doubles, log_scales: Doubles) -> NDArray[np.uint8]:
         return to_uint8((log_scales + np.log(_shrink(means, bits)) + 10) * 16)
 
-    yield _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
-    yield from section(positions, "means")
-    yield from section(lambda logits: to_uint8(sigmoid(logits) * 255), "opacity_logits")
-    yield from section(lambda sh: to_uint8(sh[:, 0] * _DC_STEPS + 127.5), "sh")
-    yield from section(scales, "means", "log_scales")
-    yield from section(_pack_quats, "quats")
-    yield from section(lambda sh: to_uint8(sh[:, 1:] * 128 + 128), "sh")
+    return [
+        attribute(positions, "means"),
+        attribute(lambda logits: to_uint8(sigmoid(logits) * 255), "opacity_logits"),
+        attribute(lambda sh: to_uint8(sh[:, 0] * _DC_STEPS + 127.5), "sh"),
+        attribute(scales, "means", "log_scales"),
+        attribute(_pack_quats, "quats"),
+        attribute(lambda sh: to_uint8(sh[:, 1:] * 128 + 128), "sh"),
+    ]
 
 
 def count_out_of_range(gaussians: GaussianSource) -> int:
@@ -174,10 +161,11 @@ def share_of_clamped_harmonics(gaussians: GaussianSource) -> float:
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
-    """The Gaussians in the bytes of an SPZ file, version 2 or 3, in the file's axes.
+    """The Gaussians in the bytes of an SPZ file, version 1 to 4, in the world's axes.
 
-    SH degree 4 is reduced to 3, and extensions are ignored. Opacities of exactly 0 and 1, whose
-    logits are infinite, are clamped by a quarter of a quantisation step.
+    SH degree 4 is reduced to 3, and extensions other than the one that names the axes are ignored.
+    Opacities of exactly 0 and 1, whose logits are infinite, are clamped by a quarter of a
+    quantisation step.
 
     Args:
         file: The file that error messages name.
@@ -185,64 +173,27 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
     Raises:
         UserError: The file is not SPZ, another version, truncated, or inconsistent with its header.
     """
-
-    def wrong(what: str) -> UserError:
-        return UserError(what, file=file, fix=_FIX)
-
-    if data[:4] == struct.pack("<I", _MAGIC):
-        raise wrong("expected SPZ version 2 or 3, found version 4 or later")
-    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
-        head = stream.decompress(data, _HEADER.size)
-        if len(head) < _HEADER.size:
-            raise wrong(f"expected an SPZ header of {_HEADER.size} bytes, found {len(head)}")
-        magic, version, count, degree, bits, flags, _ = _HEADER.unpack(head)
-        if magic != _MAGIC:
-            raise wrong("expected an SPZ file, found another gzip file")
-        if version not in (2, 3):
-            raise wrong(f"expected SPZ version 2 or 3, found version {version}")
-        if count > MAX_GAUSSIANS or degree >= len(_HIGHER) or bits > 24:
-            raise wrong(
-                f"expected up to {MAX_GAUSSIANS} Gaussians, SH degree 0 to 4 and 0 to 24 fraction "
-                f"bits, found {count}, {degree} and {bits}"
-            )
-        higher = _HIGHER[degree]
-        widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * higher)
-        expected = count * sum(widths)
-        if expected > _MAX_EXPANSION * len(data):
-            raise wrong(
-                f"expected Gaussians of at most {_MAX_EXPANSION} times the file's size, found "
-                f"{expected} bytes of them"
-            )
-        # One byte more than expected shows an excess; a malicious file could exhaust the memory.
-        body = stream.decompress(stream.unconsumed_tail, expected + 1)
-    except zlib.error as error:
-        raise wrong(f"expected an SPZ file (gzip), could not read it: {error}") from None
-    if len(body) < expected:
-        raise wrong(f"expected {expected} bytes of {count} Gaussians, found {len(body)}")
-    if not flags & _HAS_EXTENSIONS:
-        if len(body) > expected:
-            raise wrong(f"expected {expected} bytes of {count} Gaussians, found more")
-        if not stream.eof:  # The checksum is at the end.
-            raise wrong("expected a complete gzip stream, found one without its end")
-
-    table = np.frombuffer(body, np.uint8, expected)
-    ends = count * np.cumsum(widths)
-    fixed, alphas, dc, scales, quats, rest = (
-        part.reshape(count, width)
-        for part, width in zip(np.split(table, ends[:-1]), widths, strict=True)
-    )
-    sh = np.empty((count, min(higher, _HIGHER[3]) + 1, 3), np.float32)
+        header, attributes, axes = unpack(data)
+    except ValueError as error:
+        raise UserError(str(error), file=file, fix=_FIX) from None
+    positions, alphas, dc, scales, quats, rest = attributes
+    count, higher = header.number, HIGHER[header.degree]
+    sh = np.empty((count, min(higher, HIGHER[3]) + 1, 3), np.float32)
     sh[:, 0] = (dc - np.float32(127.5)) / np.float32(_DC_STEPS)
     sh[:, 1:] = (rest.reshape(count, higher, 3)[:, : sh.shape[1] - 1] - np.float32(128)) / 128
-    arrays = {
-        "means": _unpack_positions(fixed) * 2.0**-bits,
+    if header.version == 1:
+        means = positions.view("<f2").astype(np.float64)
+    else:
+        means = _unpack_positions(positions) * 2.0**-header.fraction_bits
+    arrays: dict[str, NDArray[Any]] = {
+        "means": means,
         "log_scales": scales / 16.0 - 10,
-        "quats": _unpack_quats_v2(quats) if version == 2 else _unpack_quats(quats),
+        "quats": (_unpack_quats if header.version >= 3 else _unpack_quats_v2)(quats),
         "opacity_logits": logit_of_byte(alphas[:, 0]),
         "sh": sh,
     }
-    return Gaussians.from_arrays(arrays)
+    return Gaussians.from_arrays(flip(arrays, axes))
 
 
 def _fraction_bits(gaussians: GaussianSource) -> int:
@@ -309,7 +260,7 @@ def _unpack_quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _unpack_quats_v2(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """(N, 3) bytes of xyz (SPZ version 2) to (N, 4) wxyz."""
+    """(N, 3) bytes of xyz (SPZ versions 1 and 2) to (N, 4) wxyz."""
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], 1)

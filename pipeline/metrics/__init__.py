@@ -1,1 +1,1 @@
-"""Image quality (PSNR, SSIM, LPIPS), pose errors, and evaluation on test views."""
+"""Image quality (PSNR, SSIM, FLIP, LPIPS), pose errors, and evaluation on test views."""

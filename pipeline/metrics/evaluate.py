@@ -19,6 +19,7 @@ from pipeline.metrics.evaluation import (
     ProtocolDescription,
     ViewMetrics,
 )
+from pipeline.metrics.flip import FLIP_VARIANT
 from pipeline.metrics.image import SSIM_VARIANT
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, Lpips, lpips_available
 from pipeline.metrics.protocol import Protocol
@@ -120,6 +121,7 @@ def evaluate_views(
         psnr_without_gains=_mean([view.without_gains for view in measured]),
         psnr_without_fit=without_fit,
         ssim=float(np.mean([view.ssim for view in per_view])),
+        flip=_mean([view.flip for view in per_view]),
         lpips=_mean([view.lpips for view in per_view]),
         lpips_reason=reason,
         per_view=per_view,
@@ -131,6 +133,7 @@ def evaluate_views(
             num_photographs=_split_photographs(protocol.views),
             psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
             ssim=SSIM_VARIANT,
+            flip=FLIP_VARIANT,
             lpips=LPIPS_VARIANTS[config.lpips_net] if lpips is not None else reason,
             masks=_describe_masks(protocol, measured),
             background=protocol.background,
@@ -188,8 +191,14 @@ def _compare(
 ) -> _Measured:
     """Write ``image``, the render with the exposure of its photograph, and compare it with that."""
     Image.fromarray(image).save(file, compress_level=PNG_LEVEL)
-    psnr, ssim = found.psnr(image), found.ssim(image)
-    record = ViewMetrics(name=found.view, psnr=psnr, ssim=ssim, lpips=lpips, render=file.name)
+    record = ViewMetrics(
+        name=found.view,
+        psnr=found.psnr(image),
+        ssim=found.ssim(image),
+        flip=found.flip(image),
+        lpips=lpips,
+        render=file.name,
+    )
     without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
     without_fit = None if found.own is None else found.psnr(to_bytes(found.own))
     return _Measured(record, without_gains, without_fit, found.is_masked)

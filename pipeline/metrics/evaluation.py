@@ -18,6 +18,9 @@ class ViewMetrics(JsonObject):
     name: str = Field(description="The photograph's name.")
     psnr: float = Field(description="PSNR, dB.")
     ssim: float = Field(description="SSIM, at most 1.")
+    flip: float | None = Field(
+        None, description="FLIP, 0 to 1; lower is better. null where it was not measured."
+    )
     lpips: float | None = Field(description="null where it was not measured.")
     render: str = Field(description="File in `evaluate/renders/`.")
 
@@ -56,6 +59,7 @@ class ProtocolDescription(JsonObject):
     )
     psnr: str = Field(description="Definition of `psnr`.")
     ssim: str = Field(description="Definition of `ssim`.")
+    flip: str | None = Field(None, description="Definition of `flip`; null where not measured.")
     lpips: str = Field(description="Definition of `lpips`, or why it was not measured.")
     masks: str | None = Field(description="Use of masks; null without masks.")
     background: Vector3 = Field(description="RGB in 0..1 behind transparent photographs.")
@@ -76,6 +80,11 @@ class SceneQuality(JsonObject):
 
     psnr: float = Field(description="Mean PSNR of the measured views, dB.")
     ssim: float = Field(description="Mean SSIM of the measured views.")
+    flip: float | None = Field(
+        None,
+        description="Mean FLIP of the measured views, 0 to 1; lower is better. null where it was "
+        "not measured.",
+    )
     lpips: float | None = Field(description="Mean LPIPS; null where it was not measured.")
     lpips_reason: str = Field(description="Why LPIPS was not measured; empty where it was.")
     train_psnr: float | None = Field(

@@ -47,10 +47,10 @@ def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
     Raises:
         UserError: No pixel is unmasked.
     """
-    keep = _checked(image, reference, mask)
+    keep = checked_mask(image, reference, mask)
     squared = np.empty(image.shape)
-    for rows in _bands(image):
-        squared[rows] = (_in_float64(image[rows]) - _in_float64(reference[rows])) ** 2
+    for rows in bands(image):
+        squared[rows] = (as_float64(image[rows]) - as_float64(reference[rows])) ** 2
     error = float(np.mean(squared if keep is None else squared[keep]))
     return min(-10.0 * np.log10(error), PSNR_CAP) if error > 0.0 else PSNR_CAP
 
@@ -74,13 +74,13 @@ def ssim(
     Raises:
         UserError: No pixel is left to average, or a side is under 11 pixels with "valid".
     """
-    keep = _checked(image, reference, mask)
+    keep = checked_mask(image, reference, mask)
     values: NDArray[np.float64] = np.empty(image.shape)
-    for rows in _bands(image):
+    for rows in bands(image):
         # The windows of the band's pixels reach beyond it.
         first = max(rows.start - _RADIUS, 0)
         reached = slice(first, rows.stop + _RADIUS)
-        x, y = _in_float64(image[reached]), _in_float64(reference[reached])
+        x, y = as_float64(image[reached]), as_float64(reference[reached])
         if keep is not None:
             x = np.where(keep[reached, :, None], x, y)
         values[rows] = _ssim_map(x, y)[rows.start - first : rows.stop - first]
@@ -119,7 +119,7 @@ def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(blurred, np.float64).reshape(values.shape)
 
 
-def _bands(image: NDArray[Any]) -> Iterator[slice]:
+def bands(image: NDArray[Any]) -> Iterator[slice]:
     """Bands of rows, each of about ``_BAND_PIXELS``."""
     height, width = image.shape[:2]
     step = max(_BAND_PIXELS // max(width, 1), 1)
@@ -127,11 +127,11 @@ def _bands(image: NDArray[Any]) -> Iterator[slice]:
         yield slice(start, min(start + step, height))
 
 
-def _in_float64(image: NDArray[Any]) -> NDArray[np.float64]:
+def as_float64(image: NDArray[Any]) -> NDArray[np.float64]:
     return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
 
 
-def _checked(
+def checked_mask(
     image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
 ) -> NDArray[np.bool_] | None:
     """The pixels that are measured; None for all.

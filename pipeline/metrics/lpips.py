@@ -1,6 +1,7 @@
 """LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual
-Metric", 2018), computed if its trained weights are on this machine; nothing is downloaded.
-Without the weights, or with wrong ones, the metric is unavailable and the reason is reported.
+Metric", 2018), computed if its trained weights are on this machine. ``fetch_weights`` downloads
+them; nothing else does. Without the weights, or with wrong ones, the metric is unavailable and the
+reason is reported.
 
 Two files are needed, both in ``$TORCH_HOME/hub/checkpoints`` (``~/.cache/torch`` by default):
 
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runtime.download import RemoteFile
 from pipeline.runtime.errors import UserError
 
 if TYPE_CHECKING:
@@ -38,6 +40,12 @@ LPIPS_VARIANTS: dict[str, str] = {
     "vgg": "LPIPS v0.1, VGG16, inputs [0,1] as INRIA",
     "alex": "LPIPS v0.1, AlexNet, inputs [0,1] as INRIA",
 }
+
+FETCH: dict[str, str] = {
+    "vgg": "splatmake fetch lpips",
+    "alex": "splatmake fetch lpips --net alex",
+}
+"""The command that downloads the weights."""
 
 MIN_SIDE = 32
 """Least side of an image in pixels: the networks reduce smaller images to nothing."""
@@ -65,15 +73,31 @@ class _Conv:
 
 @dataclass(frozen=True)
 class _Network:
-    backbone: str
-    heads: tuple[str, ...]
+    """A network with its weights; other programs store the heads as ``other_name``."""
+
+    backbone: RemoteFile
+    heads: RemoteFile
+    other_name: str
     convs: tuple[_Conv, ...]
 
 
+_BACKBONES = "https://download.pytorch.org/models"
+_HEADS = "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1"
 _NETWORKS = {
     "vgg": _Network(
-        "vgg16-397923af.pth",
-        ("lpips_vgg.pth", "vgg.pth"),
+        RemoteFile(
+            "vgg16-397923af.pth",
+            f"{_BACKBONES}/vgg16-397923af.pth",
+            553_433_881,
+            "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+        ),
+        RemoteFile(
+            "lpips_vgg.pth",
+            f"{_HEADS}/vgg.pth",
+            7289,
+            "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+        ),
+        "vgg.pth",
         (
             _Conv(0, 64),
             _Conv(2, 64, tap=True),
@@ -91,8 +115,19 @@ _NETWORKS = {
         ),
     ),
     "alex": _Network(
-        "alexnet-owt-7be5be79.pth",
-        ("lpips_alex.pth", "alex.pth"),
+        RemoteFile(
+            "alexnet-owt-7be5be79.pth",
+            f"{_BACKBONES}/alexnet-owt-7be5be79.pth",
+            244_408_911,
+            "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+        ),
+        RemoteFile(
+            "lpips_alex.pth",
+            f"{_HEADS}/alex.pth",
+            6009,
+            "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+        ),
+        "alex.pth",
         (
             _Conv(0, 64, kernel=11, stride=4, padding=2, tap=True),
             _Conv(3, 192, kernel=5, padding=2, pool=(3, 2), tap=True),
@@ -109,14 +144,37 @@ def _weight_files(network: _Network) -> tuple[Path, Path]:
     cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
     home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
     folder = Path(home).expanduser() / "hub" / "checkpoints"
-    found = (folder / name for name in network.heads if (folder / name).is_file())
-    return folder / network.backbone, next(found, folder / network.heads[0])
+    heads, other = folder / network.heads.name, folder / network.other_name
+    if other.is_file() and not heads.is_file():
+        heads = other
+    return folder / network.backbone.name, heads
 
 
 def weights_found(net: Net) -> dict[str, int]:
     """Names and sizes in bytes of the weight files that exist. Does not import torch."""
     files = () if net == "none" else _weight_files(_NETWORKS[net])
     return {file.name: file.stat().st_size for file in files if file.is_file()}
+
+
+def fetch_weights(net: Net) -> list[str]:
+    """Download the weight files that are missing or not the published ones.
+
+    Returns:
+        A line for each file, with where it is.
+
+    Raises:
+        UserError: A file cannot be downloaded.
+    """
+    lines = []
+    network = _NETWORKS[net]
+    for file, path in zip((network.backbone, network.heads), _weight_files(network), strict=True):
+        found = file.is_at(path)
+        if not found:
+            # Heads of another name may be those of another program's release.
+            path = path.with_name(file.name)
+            file.download(path)
+        lines.append(f"{path}: {'was there' if found else f'downloaded from {file.url}'}")
+    return lines
 
 
 def _reason(file: Path, what: str, error: Exception) -> str:
@@ -128,7 +186,7 @@ def lpips_available(net: Net) -> tuple[Lpips | None, str]:
 
     Returns:
         ``(measure, "")``, or ``(None, reason)`` where a file is missing or not what it should
-        be; the reason names the file and the folder it belongs into.
+        be. The reason becomes part of the result: it holds no path of this machine.
         ``measure(image, reference, mask)`` takes (H, W, 3), floats in [0, 1] or uint8 where 255
         represents 1, and a mask (H, W) or None, and returns the distance (0 for identical
         pictures). Masked (zero) pixels of the image are replaced by the reference's and each layer
@@ -139,18 +197,12 @@ def lpips_available(net: Net) -> tuple[Lpips | None, str]:
         return None, "switched off"
     network = _NETWORKS[net]
     backbone_file, heads_file = _weight_files(network)
-    # The reason becomes part of the result: it holds no path of this machine.
-    missing = [file.name for file in (backbone_file, heads_file) if not file.is_file()]
-    if missing:
-        return None, (
-            f"weights not found: put {' and '.join(missing)} into hub/checkpoints of torch's "
-            "folder ($TORCH_HOME, by default ~/.cache/torch): torchvision's ImageNet backbone "
-            f"{network.backbone}, and the linear heads of LPIPS v0.1 as {network.heads[0]}"
-        )
+    if not (backbone_file.is_file() and heads_file.is_file()):
+        return None, f"its weights are not on this machine: run {FETCH[net]}"
     try:
         weights = _backbone(_load(backbone_file), network)
     except Exception as error:
-        what = f"is not torchvision's {network.backbone}"
+        what = f"is not torchvision's {network.backbone.name}"
         return None, _reason(backbone_file, what, error)
     try:
         heads = _heads(_load(heads_file), network)

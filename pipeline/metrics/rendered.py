@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Train
+from pipeline.metrics.flip import flip
 from pipeline.metrics.image import psnr, ssim
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.protocol import Protocol
@@ -69,6 +70,11 @@ class Rendered:
         """SSIM of an image over the measured columns."""
         here = self.columns
         return ssim(image[:, here], self.photo[:, here], self.measured_mask)
+
+    def flip(self, image: NDArray[np.uint8]) -> float:
+        """FLIP of an image over the measured columns."""
+        here = self.columns
+        return flip(image[:, here], self.photo[:, here], self.measured_mask)
 
     def distance(self, image: NDArray[np.uint8], lpips: Lpips) -> float:
         """LPIPS of an image over the measured columns."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class DenseCounters(StageCounters):
@@ -21,3 +22,7 @@ class DenseCounters(StageCounters):
         ge=0, le=1, description="Mean confidence of the pixels with a depth; 0 without any."
     )
     dense_points: int = Field(ge=0, description="Number of points of the fused cloud.")
+
+    def headline(self) -> str:
+        maps = counted(self.depth_maps, "depth map")
+        return f"{maps}, {self.completeness:.0%} complete; {counted(self.dense_points, 'point')}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class InspectCounters(StageCounters):
@@ -29,6 +30,13 @@ class InspectCounters(StageCounters):
         None, ge=0, description="Number of points in the point cloud; absent without one."
     )
 
+    def headline(self) -> str:
+        parts = [counted(self.photos, "photograph")] if self.photos or not self.videos else []
+        parts += [counted(self.videos, "video")] if self.videos else []
+        parts += [f"{self.left_out} left out"] if self.left_out else []
+        parts += [counted(self.given_poses, "given pose")] if self.given_poses else []
+        return ", ".join(parts)
+
 
 class DecodeCounters(StageCounters):
     """Counters of the decode stage."""
@@ -47,6 +55,11 @@ class DecodeCounters(StageCounters):
         description="Name of each video to the number of frames that can be decoded; absent "
         "without videos.",
     )
+
+    def headline(self) -> str:
+        frames = sum((self.frames_chosen or {}).values())
+        text = f"{counted(self.developed, 'photograph')} developed"
+        return f"{counted(frames, 'video frame')} chosen" if frames else text
 
 
 class UndistortCounters(StageCounters):
@@ -69,3 +82,11 @@ class UndistortCounters(StageCounters):
         description="Share of the pixels of split photographs, inside the image circle of the "
         "lens, that are in some view; absent if none was split.",
     )
+
+    def headline(self) -> str:
+        text = f"{counted(self.undistorted, 'photograph')} undistorted"
+        return (
+            f"{counted(self.split, 'photograph')} split into {self.views} views"
+            if self.split
+            else text
+        )

@@ -102,19 +102,31 @@ def plan_record(plan: Plan) -> PlanRecord:
     )
 
 
-def describe(plan: Plan) -> str:
-    """The plan for the terminal: the stages that run, and the skipped stages by their reason."""
+def describe(plan: Plan, *, full: bool = True, finished: Collection[str] = ()) -> str:
+    """The plan for the terminal: the stages that run, and the skipped stages.
+
+    Args:
+        full: Whether the stages' decisions and the reasons for skipping stages are listed.
+        finished: Stages that have a result, and are listed by name alone.
+    """
     lines = [f"{plan.scene}: {found(plan.facts)}"]
     skipped: dict[str, list[str]] = {}
+    if finished:
+        named = [name for name in plan.stages if name in finished]
+        lines.append(f"  finished: {', '.join(named)}")
     for name, stage in plan.stages.items():
+        if stage.run and name in finished:
+            continue
         if stage.run:
             lines.append(f"  {name:<10} {stage.reason}")
-            lines += [f"  {'':<10} - {decision}" for decision in stage.decisions]
+            lines += [f"  {'':<10} - {decision}" for decision in stage.decisions if full]
         else:
             skipped.setdefault(stage.reason, []).append(name)
     if skipped:
-        grouped = [f"{', '.join(names)} ({reason})" for reason, names in skipped.items()]
-        lines.append(f"  skipped: {'; '.join(grouped)}")
+        grouped = [
+            ", ".join(names) + (f" ({reason})" if full else "") for reason, names in skipped.items()
+        ]
+        lines.append(f"  skipped: {('; ' if full else ', ').join(grouped)}")
     lines += [f"  warning: {warning}" for warning in plan.warnings]
     return "\n".join(lines)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.config.schema import Config, Split, Train, Views
@@ -20,9 +22,9 @@ from pipeline.runtime.layout import rerun_command
 from pipeline.runtime.record import STAGE, read_stage
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.normalization import IDENTITY
+from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
-from pipeline.scene.views import View, load_views
+from pipeline.scene.views import View, load_views, scene_up
 
 # The stages with photographs, in the order of preference.
 _STAGES_WITH_PHOTOS = ("undistort", "decode", "inspect")
@@ -37,6 +39,9 @@ class PosedScene:
     Attributes:
         gains: The exposure gains of all views; empty if exposure is not modelled.
         warnings: The warnings of the scan.
+        up: (3,) unit vector, the up direction in the world of the views.
+        unit: From the unit of exported files, which is that of given poses, to the world of the
+            views; the identity if the views are in that unit.
     """
 
     views: list[View]
@@ -44,6 +49,8 @@ class PosedScene:
     train: Train
     gains: ExposureGains
     warnings: tuple[str, ...]
+    up: NDArray[np.float64]
+    unit: Normalization
 
 
 class _Settings(BaseModel):
@@ -94,12 +101,12 @@ def posed_scene(
         listed=found.listed,
         base_folder=found.base_folder,
     )
-    unit = given.normalization.without_origin() if exported else IDENTITY
-    model = unit.model_to_given(given.model)
+    unit, model = _in_unit(given.normalization, given.model, exported)
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
     train = Train(background="white" if found.num_alpha else "black")
-    return PosedScene(views, split, train, NO_GAINS, found.warnings)
+    up = scene_up(views, found.manifest)
+    return PosedScene(views, split, train, NO_GAINS, found.warnings, up, unit)
 
 
 def _finished(
@@ -120,9 +127,9 @@ def _finished(
     if every is not None:
         split = split.model_copy(update={"source": "every", "test_every": every})
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
+    manifest = Manifest.read(photos)
     model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"), points=False)
-    if exported:
-        model = results_normalization(folder).without_origin().model_to_given(model)
+    unit, model = _in_unit(results_normalization(folder), model, exported)
     _check_pinhole(model, folder)
     # The paths of photographs may be relative to the folder in which Snakemake ran.
     root = folder.absolute().parent.parent
@@ -130,10 +137,19 @@ def _finished(
         replace(
             view, image=_resolved(root, view.image), mask=view.mask and _resolved(root, view.mask)
         )
-        for view in load_views(Manifest.read(photos), model, views, split)
+        for view in load_views(manifest, model, views, split)
     ]
     gains = ExposureGains.read_for(trained, [view.name for view in found])
-    return PosedScene(found, split, settings.train, gains, ())
+    up = scene_up(found, manifest)
+    return PosedScene(found, split, settings.train, gains, (), up, unit)
+
+
+def _in_unit(
+    normalization: Normalization, model: Reconstruction, exported: bool
+) -> tuple[Normalization, Reconstruction]:
+    """``PosedScene.unit``, and the model in the unit of exported files if ``exported``."""
+    unit = normalization.without_origin()
+    return (IDENTITY, unit.model_to_given(model)) if exported else (unit, model)
 
 
 def _unfinished(folder: Path, missing: str) -> UserError:

@@ -3,13 +3,17 @@ torch."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render import Forward, RasterCamera, RasterOptions
+from pipeline.runtime.atomic import write_bytes
 from pipeline.scene.views import View, reduced_size
 from pipeline.splats.gaussians import Gaussians
 
@@ -32,6 +36,14 @@ class Render(NamedTuple):
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
     median_depth: NDArray[np.float32]
+
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Render({width}x{height} pixels)"
+
+    def save(self, file: str | PathLike[str]) -> None:
+        """Write the colours as an 8-bit PNG file."""
+        write_png(Path(file), to_bytes(self.rgb))
 
 
 def near_plane(extent: float) -> float:
@@ -103,3 +115,12 @@ def to_bytes(image: Any) -> NDArray[np.uint8]:
     scaled = np.clip(np.asarray(image), 0, 1)
     scaled *= 255
     return np.rint(scaled, out=scaled).astype(np.uint8)
+
+
+def write_png(file: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image (H, W, 3) as PNG."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    write_bytes(file, buffer.getvalue())

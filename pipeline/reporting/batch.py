@@ -21,6 +21,7 @@ PUBLISHED = Path(__file__).with_name("published.json")
 MEASURES = (
     "psnr",
     "ssim",
+    "flip",
     "lpips",
     "train_psnr",
     "num_gaussians",
@@ -89,6 +90,7 @@ def row(result: Result, stages: Sequence[str] = ()) -> dict[str, Any]:
         "message": "; ".join(line.strip() for line in result.message.splitlines()),
         "psnr": m.get("psnr"),
         "ssim": m.get("ssim"),
+        "flip": m.get("flip"),
         "lpips": m.get("lpips"),
         "train_psnr": m.get("train_psnr"),
         "views": protocol.get("num_views"),

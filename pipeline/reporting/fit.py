@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.io.splat_codec import sigmoid
 from pipeline.io.spz import encode_spz
 from pipeline.splats.arrays import GaussianArrays, GaussianRows
+from pipeline.splats.axes import RUB, Flipped
 
 # Size of the sample from which the compressed size is estimated, and a safety factor.
 _SAMPLE = 20_000
@@ -18,7 +19,11 @@ _MARGIN = 0.95
 
 @dataclass(frozen=True)
 class Packed:
-    """Gaussians as bytes of an SPZ file, with their number and SH degree."""
+    """Gaussians as bytes of an SPZ file, with their number and SH degree.
+
+    The file's coordinates are the world's, in which the viewer places cameras: they are not
+    converted to SPZ's axes.
+    """
 
     spz: bytes
     count: int
@@ -39,7 +44,7 @@ def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int)
     step = max(len(gaussians) // _SAMPLE, 1)
     sample, degree, number = np.arange(0, len(gaussians), step), gaussians.sh_degree, 0
     for degree in range(gaussians.sh_degree, -1, -1):
-        each = len(encode_spz(GaussianRows(gaussians, sample, degree))) / len(sample)
+        each = len(_encode(gaussians, sample, degree)) / len(sample)
         number = max(int(max_bytes * _MARGIN / each), 0)
         if number >= len(gaussians):
             break
@@ -47,7 +52,12 @@ def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int)
     if number < len(rows):
         rank = np.argsort(-prominence(gaussians, centres), kind="stable")
         rows = np.sort(rank[:number])
-    return Packed(encode_spz(GaussianRows(gaussians, rows, degree)), len(rows), degree)
+    return Packed(_encode(gaussians, rows, degree), len(rows), degree)
+
+
+def _encode(gaussians: GaussianArrays, rows: NDArray[np.intp], degree: int) -> bytes:
+    # Flipping before the writer does keeps the world's coordinates.
+    return encode_spz(Flipped(GaussianRows(gaussians, rows, degree), RUB))
 
 
 def prominence(gaussians: GaussianArrays, centres: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -37,6 +37,7 @@ _THUMBNAIL_QUALITY = 84
 _MEASURES = {
     "psnr": ("PSNR, dB", 2),
     "ssim": ("SSIM", 4),
+    "flip": ("FLIP", 3),
     "lpips": ("LPIPS", 3),
     "num_gaussians": ("Gaussians", 0),
     "size_mb": ("PLY, MB", 1),
@@ -236,6 +237,7 @@ def _means_charts(
 _ERRORS: dict[str, tuple[str, Callable[[float], str]]] = {
     "psnr": ("Pixel error against time", lambda value: f"{value:.3g} %"),
     "ssim": ("1 - SSIM against time", lambda value: f"{value:.2g}"),
+    "flip": ("FLIP against time", lambda value: f"{value:.2g}"),
     "lpips": ("LPIPS against time", lambda value: f"{value:.2g}"),
 }
 

@@ -16,7 +16,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.reporting.data import SceneResults
+from pipeline.reporting.depths import COLUMNS, DEPTH_RATIO, ROWS, coarse_depths, depth_codes
 from pipeline.reporting.fit import Packed, fit
+from pipeline.reporting.pictures import Embedded, embedded, shrunk, upright
 from pipeline.reporting.text import count
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 _VIEWER = Path(__file__).with_name("viewer") / "viewer.min.js"
 
 _MAX_POINTS = 25_000
+# The longer side of the poster in pixels, and its JPEG quality.
+_POSTER = (1000, 80)
 # The scene's box is [-1, 1]; points within this multiple of it are stored as 16-bit integers.
 _REACH = 4.0
 _STEP = _REACH / 32767
@@ -40,11 +44,14 @@ class ViewerContent(NamedTuple):
         shown: A sentence on the Gaussians in the page.
         data: The viewer's input as JSON (``viewer_data``).
         spz: The Gaussians as SPZ in base64.
+        poster: The render of the initial camera, shown until the Gaussians are; None if there is
+            none.
     """
 
     shown: str
     data: Markup
     spz: str
+    poster: Embedded | None = None
 
 
 def viewer_script() -> Markup:
@@ -66,7 +73,18 @@ def viewer_content(results: SceneResults, max_bytes: int) -> ViewerContent:
         shown=_shown(results.trained.gaussians, packed),
         data=htmlsafe_json_dumps(viewer_data(results), separators=(",", ":")),
         spz=_base64(packed.spz),
+        poster=viewer_poster(results),
     )
+
+
+def viewer_poster(results: SceneResults) -> Embedded | None:
+    """The render of the initial camera."""
+    start = _start(results)
+    for view in results.comparisons:
+        if start is not None and view.name == results.trained.views[start].name:
+            side, quality = _POSTER
+            return embedded(shrunk(upright(view.render, view.orientation), side), quality)
+    return None
 
 
 def sized_for_spz(results: SceneResults) -> SceneResults:
@@ -115,7 +133,8 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
         pixels, in display orientation, with ``world_to_camera`` (3, 4) row by row; ``start``: index
         of the initial camera, or null; ``points``: base64 of int16 (P, 3), little-endian, in
         the page's frame in units of ``step``; ``colours``: base64 of uint8 (P, 3); ``size`` of a
-        camera.
+        camera; ``depths``: ``codes``, base64 of the ``depth_codes`` of each camera, ``rows`` and
+        ``columns``, and ``first`` (the page's unit) and ``ratio``, which decode them.
     """
     scene, points = results.trained, results.points
     cameras = [upright_camera(v, scene.orientations.get(v.name, 1)) for v in scene.views]
@@ -123,6 +142,7 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
     poses = np.array([c["world_to_camera"] for c in cameras]).reshape(-1, 3, 4)
     finite = np.isfinite(points.xyz).all(axis=1)
     xyz, rgb = points.xyz[finite], points.rgb[finite]
+    depths = coarse_depths(scene.gaussians, cameras, scene.near)
     middle, radius = _robust_box(xyz, centres)
     rotation = upright_frame(poses[:, :, :3])
     frame = np.eye(4)
@@ -146,6 +166,13 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
         "step": _STEP,
         "colours": _base64(np.ascontiguousarray(rgb, np.uint8).tobytes()),
         "size": _camera_size(centres / radius),
+        "depths": {
+            "rows": ROWS,
+            "columns": COLUMNS,
+            "first": scene.near / radius,
+            "ratio": DEPTH_RATIO,
+            "codes": _base64(depth_codes(depths, scene.near).tobytes()),
+        },
     }
 
 
@@ -175,11 +202,13 @@ def upright_camera(view: View, orientation: int) -> dict[str, Any]:
 
 
 def _start(results: SceneResults) -> int | None:
-    """Index of the view of median PSNR, else of the middle view; None without views."""
+    """Index of the compared view of median PSNR, else of the best, else of the middle view; None
+    without views."""
     names = [view.name for view in results.trained.views]
-    for comparison in results.comparisons:
-        if comparison.label == "median" and comparison.name in names:
-            return names.index(comparison.name)
+    for label in ("median", "best"):
+        for comparison in results.comparisons:
+            if comparison.label == label and comparison.name in names:
+                return names.index(comparison.name)
     return len(names) // 2 if names else None
 
 

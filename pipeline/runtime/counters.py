@@ -24,6 +24,10 @@ class StageCounters(BaseModel):
         """The ``counters`` of ``stage.json``."""
         return self.model_dump(mode="json", exclude_unset=True)
 
+    def headline(self) -> str:
+        """What the stage found or made, in a few words for the terminal; may be empty."""
+        return ""
+
 
 class NoCounters(StageCounters):
     """Counters of a stage that has none."""

@@ -40,7 +40,7 @@ from pipeline.runtime.errors import (
 from pipeline.runtime.facts import run_record
 from pipeline.runtime.layout import SCAN_CACHE
 from pipeline.runtime.lock import locked, logging_to
-from pipeline.runtime.progress import write_progress_to
+from pipeline.runtime.progress import position, progress_file, write_progress_to
 from pipeline.runtime.record import (
     HIDDEN_STAGE,
     RUN,
@@ -195,7 +195,8 @@ def run_stage(
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work, counters)
         except KeyboardInterrupt:
-            print(f"{request.name}: interrupted", file=sys.stderr, flush=True)
+            at = f" at {position()}" if position() else ""
+            print(f"{request.name}: stopped{at}", file=sys.stderr, flush=True)
             return EXIT_INTERRUPTED
         except Terminated:
             print(f"{request} was terminated (SIGTERM or SIGHUP)", file=sys.stderr, flush=True)
@@ -264,7 +265,7 @@ def _run_locked(
         os.environ["TMPDIR"] = str(scratch / "tmp")
         (scratch / "tmp").mkdir(exist_ok=True)
         tempfile.tempdir = None
-        write_progress_to(scene_folder / ".scratch" / "progress.json")
+        write_progress_to(progress_file(scene_folder, request.name))
         start = time.perf_counter()
         try:
             work(job)

@@ -21,6 +21,10 @@ WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 SCAN_CACHE = ".scratch/scan.json"
 """In a run's folder of results: facts about the files of its scene (``pipeline.io.fact_cache``)."""
 
+STAGE_OUTPUT = "SPLATMAKE_STAGE_OUTPUT"
+"""Environment variable: "log" if stages write to their logs alone, because Snakemake shows what
+they find."""
+
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
 """Native libraries in wheels."""
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TextIO
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import STAGE_OUTPUT
 from pipeline.runtime.progress import Console
 
 _held: dict[Path, TextIO] = {}
@@ -138,11 +139,15 @@ def locked(path: Path, stage: str, out: Path) -> Iterator[None]:
 
 @contextmanager
 def logging_to(path: Path | None, name: str) -> Iterator[None]:
-    """Copy stderr to the file ``path``; progress lines on the terminal begin with ``name``."""
+    """Copy stderr to the file ``path``; progress lines on the terminal begin with ``name``.
+
+    If the environment variable ``STAGE_OUTPUT`` is "log", stderr is replaced by the file, also for
+    compiled libraries and child processes.
+    """
     if path is None:
         yield
         return
-    terminal = sys.stderr
+    terminal: TextIO = sys.stderr
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         log = open(path, "w", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115  (closed below)
@@ -150,14 +155,21 @@ def logging_to(path: Path | None, name: str) -> Iterator[None]:
         # The stage will fail for the same reason, with a complete message.
         yield
         return
-    console = Console(terminal, log, f"{name}: ")
-    sys.stderr = console  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        console.clear()
-        console.flush()
-        sys.stderr = terminal
+    only_log = os.environ.get(STAGE_OUTPUT) == "log"
+    terminal.flush()
+    with open(os.dup(2), "w", encoding="utf-8", errors="backslashreplace") as original:
+        if only_log:
+            os.dup2(log.fileno(), 2)
+            terminal = original
+        console = Console(terminal, log, f"{name}: ", only_log=only_log)
+        before, sys.stderr = sys.stderr, console  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            console.clear()
+            console.flush()
+            sys.stderr = before
+            os.dup2(original.fileno(), 2)
         # Closing writes what a full disk has refused before.
         with contextlib.suppress(OSError):
             log.close()

@@ -1,7 +1,9 @@
 """Progress of long work: a line on stderr and a small JSON file.
 
 In a stage (see ``Console``) the line is updated in place on an interactive terminal, and appended
-to the log every few seconds. Without a terminal, lines are appended to stderr.
+to the log every few seconds. Without a terminal, lines are appended to stderr. In a run of
+Snakemake, which shows the progress of all its jobs, a stage writes to its log and the JSON file
+alone.
 """
 
 from __future__ import annotations
@@ -14,12 +16,14 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TextIO, TypeVar
 
 from pydantic import Field
 
 from pipeline.runtime.json_file import JsonObject
+from pipeline.runtime.text import duration
 
 T = TypeVar("T")
 
@@ -47,12 +51,37 @@ class ProgressState(JsonObject):
 _ERASE = "\r\x1b[K"
 
 _file: Path | None = None
+_latest: Progress | None = None
 
 
 def write_progress_to(path: Path | None) -> None:
     """Set the file that all ``Progress`` objects write their state to, or None."""
-    global _file
+    global _file, _latest
     _file = path
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _latest = None
+
+
+def progress_text(state: ProgressState) -> str:
+    """A line on the state of some work: its position, the time left, its note."""
+    at = _position(state.unit, state.done, state.total)
+    left = f", {duration(round(state.seconds_left))} left" if state.done else ""
+    return f"{state.label}: {at}{left}{f', {state.note}' if state.note else ''}"
+
+
+def progress_file(scene_folder: Path, job: str) -> Path:
+    """The file with the progress of a job, whose stage has this folder in ``scene_folder``."""
+    return scene_folder / ".scratch" / "progress" / f"{job}.json"
+
+
+def position() -> str:
+    """The position of the last work of this process, such as "step 702 of 1500"; may be empty."""
+    return "" if _latest is None else _position(_latest.unit, _latest.done, _latest.total)
+
+
+def _position(unit: str, done: int, total: int) -> str:
+    return f"{unit.removesuffix('s')} {done} of {total}"
 
 
 class Console:
@@ -66,13 +95,17 @@ class Console:
         terminal: The original stderr.
         log: An open file, or None.
         name: The prefix of progress lines on the terminal.
+        only_log: Whether to write to the terminal only what the log cannot take.
     """
 
-    def __init__(self, terminal: TextIO, log: TextIO | None, name: str = ""):
-        self._terminal: TextIO | None = terminal
+    def __init__(
+        self, terminal: TextIO, log: TextIO | None, name: str = "", *, only_log: bool = False
+    ):
+        self._terminal: TextIO | None = None if only_log else terminal
+        self._without_log = terminal if only_log else None
         self._log = log
         self._name = name
-        self._live = is_interactive(terminal)
+        self._live = not only_log and is_interactive(terminal)
         self._shows_line = False
         self._last = 0.0
 
@@ -117,6 +150,7 @@ class Console:
                 self._log.flush()
             except OSError:
                 self._log = None
+                self._terminal = self._terminal or self._without_log
 
     def _to_terminal(self, text: str) -> None:
         if self._terminal is not None:
@@ -148,6 +182,8 @@ class Progress:
         self._samples = deque([(now, 0)])
         self._last_line = now
         self._last_file = 0.0
+        global _latest
+        _latest = self
 
     def start_at(self, done: int) -> None:
         """Resume at ``done`` units, which do not count for the rate."""
@@ -172,7 +208,7 @@ class Progress:
             self._last_line = now
         if isinstance(sys.stderr, Console):
             sys.stderr.progress(self.line(note), keep=due)
-        elif due:
+        elif due and _shown.get():
             print(self.line(note), file=sys.stderr, flush=True)
 
     def rate(self) -> float:
@@ -220,3 +256,16 @@ def track(items: Iterable[T], label: str, total: int, unit: str = "it") -> Itera
     for item in items:
         yield item
         progress.advance()
+
+
+_shown = ContextVar("_shown", default=True)
+
+
+@contextlib.contextmanager
+def progress_shown(shown: bool) -> Iterator[None]:
+    """Whether the progress of the work in the block is shown on stderr."""
+    token = _shown.set(shown)
+    try:
+        yield
+    finally:
+        _shown.reset(token)

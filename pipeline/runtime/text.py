@@ -34,6 +34,22 @@ def shown(value: Any, limit: int = 60) -> str:
         return "a number of thousands of digits"
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun, such as "1 photograph" or "2,461 photographs"."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+def duration(seconds: float) -> str:
+    """A duration such as "4.2 s", "37 s", "12 min 5 s" or "3 h 20 min"."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, of_hour = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {of_hour} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
 def shortened(text: str, limit: int = 100) -> str:
     """A text without more than its first ``limit`` characters."""
     return text if len(text) <= limit else f"{text[:limit]}..."

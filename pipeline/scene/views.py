@@ -68,6 +68,10 @@ class View:
     source: str | None = None
     crop: Crop | None = None
 
+    def __repr__(self) -> str:
+        kind = "test view" if self.is_test else "training view"
+        return f"View({self.name!r}: {self.width}x{self.height} pixels, {kind})"
+
     def cropped(self, left: int, top: int, width: int, height: int) -> View:
         """The part of this view with its upper left corner at pixel (``left``, ``top``)."""
         return replace(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from statistics import median
 from typing import Literal
 
 from pydantic import BaseModel, Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.judge import Evidence, Grade
 
@@ -18,11 +20,18 @@ class FeaturesCounters(StageCounters):
 
     counts: dict[str, int] = Field(description="Photograph's name to its number of keypoints.")
 
+    def headline(self) -> str:
+        middle = median(self.counts.values()) if self.counts else 0
+        return f"a median of {middle:.0f} keypoints in {counted(len(self.counts), 'photograph')}"
+
 
 class PairsCounters(StageCounters):
     """Counters of the pairs stage."""
 
     num_pairs: int = Field(ge=0, description="Number of pairs of photographs to match.")
+
+    def headline(self) -> str:
+        return f"{counted(self.num_pairs, 'pair')} to match"
 
 
 class MatchCounters(StageCounters):
@@ -30,6 +39,9 @@ class MatchCounters(StageCounters):
 
     num_pairs: int = Field(ge=0, description="Number of pairs that the job matched.")
     num_verified: int = Field(ge=0, description="Number of these with a two-view geometry.")
+
+    def headline(self) -> str:
+        return f"{self.num_verified} of {counted(self.num_pairs, 'pair')} verified"
 
 
 class MatchesCounters(StageCounters):
@@ -46,6 +58,10 @@ class MatchesCounters(StageCounters):
         description="Names of the photographs outside the largest component."
     )
     num_cameras: int = Field(ge=1, description="Number of cameras.")
+
+    def headline(self) -> str:
+        verified = f"{self.num_verified} of {counted(self.num_pairs, 'pair')} verified"
+        return f"{verified}, with a median of {counted(self.median_inliers, 'inlier')}"
 
 
 class CameraSummary(BaseModel):
@@ -106,6 +122,12 @@ class SfmCounters(StageCounters):
         "`georeference.json` has all of it."
     )
 
+    def headline(self) -> str:
+        return (
+            f"{self.registered} of {counted(self.total, 'photograph')} placed ({self.verdict}), "
+            f"{self.mean_reprojection_error_px:.2f} px, {counted(self.num_points, 'point')}"
+        )
+
 
 class RefineCounters(StageCounters):
     """Counters of the refine stage."""
@@ -118,3 +140,9 @@ class RefineCounters(StageCounters):
         description="Mean reprojection error of the given model, pixels."
     )
     error_px: float = Field(description="Mean reprojection error of the output, pixels.")
+
+    def headline(self) -> str:
+        if not self.freed:
+            return "the given model is kept"
+        before, after = self.error_before_px, self.error_px
+        return f"reprojection error {before:.2f} px before, {after:.2f} px after"

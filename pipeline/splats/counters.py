@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class InitCounters(StageCounters):
@@ -27,3 +28,6 @@ class InitCounters(StageCounters):
         description="Number of points triangulated with the given poses; absent where the poses "
         "have points.",
     )
+
+    def headline(self) -> str:
+        return f"{counted(self.num_gaussians, 'Gaussian')} from {counted(self.points, 'point')}"

@@ -44,6 +44,9 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self):,} of SH degree {self.sh_degree})"
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics."""

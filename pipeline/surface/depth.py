@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
 from pipeline.render import RasterOptions
-from pipeline.render.views import render_view, to_bytes
-from pipeline.runtime.atomic import write_bytes
+from pipeline.render.views import render_view, to_bytes, write_png
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -118,9 +115,7 @@ def write_renders(folder: Path, renders: RenderCache) -> None:
     """Write an 8-bit PNG of each view, named as its photograph."""
     names = rename({view.name: ".png" for view in renders.views})
     for rendered in renders:
-        buffer = io.BytesIO()
-        Image.fromarray(rendered.rgb).save(buffer, "PNG")
-        write_bytes(folder / names[rendered.view.name], buffer.getvalue())
+        write_png(folder / names[rendered.view.name], rendered.rgb)
 
 
 def write_depths(folder: Path, renders: RenderCache) -> None:

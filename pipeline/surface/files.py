@@ -111,9 +111,8 @@ def _linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rotation_to_y_up(up: NDArray[np.float64]) -> list[float]:
-    """Quaternion xyzw of the smallest rotation that takes the unit vector ``up`` to +y."""
-    cosine = float(up[1])
-    if cosine < -1 + 1e-9:
-        return [1.0, 0.0, 0.0, 0.0]
-    quaternion = np.array([-up[2], 0.0, up[0], 1 + cosine])
-    return (quaternion / np.linalg.norm(quaternion)).tolist()
+    """Quaternion xyzw of half a turn about z, to the axes of ``io.gltf``, followed by the smallest
+    rotation that then takes the unit vector ``up`` to +y."""
+    quaternion = np.array([0.0, up[2], 1 - up[1], up[0]])
+    norm = float(np.linalg.norm(quaternion))
+    return (quaternion / norm).tolist() if norm > 1e-9 else [0.0, 0.0, 0.0, 1.0]

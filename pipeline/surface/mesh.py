@@ -51,6 +51,9 @@ class Mesh:
     normals: NDArray[np.float32]
     colors: NDArray[np.uint8]
 
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices):,} vertices, {len(self.faces):,} triangles)"
+
 
 def extract(field: Tsdf, min_weight: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Marching cubes (Lewiner et al. 2003) over cells whose corners were all observed.

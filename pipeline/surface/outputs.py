@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -10,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.config.schema import Export
+from pipeline.config.video import VideoExport
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.progress import track
@@ -17,8 +18,8 @@ from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache, write_depths, write_renders
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
-from pipeline.surface.mesh import build_mesh
-from pipeline.surface.path import FPS, camera_path, describe_path
+from pipeline.surface.mesh import Mesh, build_mesh
+from pipeline.surface.path import camera_path, describe_path
 from pipeline.surface.tsdf import BLOCK
 from pipeline.surface.video import write_video
 
@@ -35,23 +36,22 @@ class Messages(NamedTuple):
 
 def write_rendered(
     out: Path,
-    formats: Collection[str],
+    config: Export,
     gaussians: Gaussians,
     views: list[View],
     options: RasterOptions,
     *,
     up: NDArray[np.float64],
-    mesh_voxel: float | None,
 ) -> Messages:
-    """Write the outputs that ``formats`` names: ``renders/``, ``depths/``, ``mesh.ply`` and
+    """Write the outputs that ``config.formats`` names: ``renders/``, ``depths/``, ``mesh.ply`` and
     ``mesh.glb``, the video and its camera path ``path.json``.
 
     Args:
         views: All views, at the size to render.
         options: The options of the rasterizer (``Protocol.options``).
         up: (3,) up vector of the world.
-        mesh_voxel: The side of a voxel, world units; None chooses one.
     """
+    formats = config.formats
     messages = Messages([], [])
     if not {"renders", "depths", "mesh"}.isdisjoint(formats):
         with TemporaryDirectory(prefix="renders-") as folder:
@@ -61,26 +61,48 @@ def write_rendered(
             if "depths" in formats:
                 write_depths(out / "depths", renders)
             if "mesh" in formats:
-                _write_mesh(out, DepthMaps(renders), up, mesh_voxel, options.threads, messages)
+                mesh = make_mesh(DepthMaps(renders), config.mesh_voxel, options.threads, messages)
+                if mesh is not None:
+                    write_mesh_ply(out / "mesh.ply", mesh)
+                    write_mesh_glb(out / "mesh.glb", mesh, up)
     if "video" in formats:
-        path = camera_path(views, _typical_depth(gaussians, views, options), up)
-        describe_path(path).write(out)
-        frames = [
-            to_bytes(render_rgb(gaussians, view, options))
-            for view in track(path, "rendering the video", len(path), unit="frames")
-        ]
-        write_video(out, frames, FPS)
+        _write_video(out, config.video, gaussians, views, options, up, messages)
     return messages
 
 
-def _write_mesh(
+def _write_video(
     out: Path,
-    depths: DepthMaps,
+    config: VideoExport,
+    gaussians: Gaussians,
+    views: list[View],
+    options: RasterOptions,
     up: NDArray[np.float64],
-    voxel: float | None,
-    threads: int,
     messages: Messages,
 ) -> None:
+    depth = _typical_depth(gaussians, views, options)
+    path, words = camera_path(views, depth, up, config)
+    describe_path(path, config.fps).write(out)
+    frames = (
+        to_bytes(render_rgb(gaussians, view, options))
+        for view in track(path, "rendering the video", len(path), unit="frames")
+    )
+    size = path[0].width, path[0].height
+    encoding = write_video(out / "video.mp4", frames, size, config.fps)
+    messages.decisions.append(
+        f"video: {words}, {len(path) / config.fps:g} s at {config.fps} frames per second, "
+        f"{size[0]}x{size[1]} pixels, {encoding}"
+    )
+
+
+def make_mesh(
+    depths: DepthMaps, voxel: float | None, threads: int, messages: Messages
+) -> Mesh | None:
+    """The mesh of the surfaces in depth maps; None, with a warning, if there is none.
+
+    Args:
+        voxel: The argument of ``build_mesh``.
+        messages: The messages that those about the mesh are added to.
+    """
     mesh, grid = build_mesh(depths, voxel, threads)
     if mesh is None or grid is None:
         why = "the depth maps of the views contain no common surface"
@@ -90,9 +112,7 @@ def _write_mesh(
                 f"surfaces are up to {grid.far:.4g} away; lower it, or leave it out"
             )
         messages.warnings.append(f"no mesh: {why}")
-        return
-    write_mesh_ply(out / "mesh.ply", mesh)
-    write_mesh_glb(out / "mesh.glb", mesh, up)
+        return None
     messages.decisions.append(
         f"mesh: {len(mesh.faces)} triangles from {len(depths)} views, voxels of {grid.voxel:.4g} "
         f"(scene unit), surfaces up to {grid.far:.4g} away"
@@ -102,6 +122,7 @@ def _write_mesh(
             f"export.mesh_voxel: voxels of {voxel:.4g} need too much memory, or are far smaller "
             f"than a pixel of the views; used {grid.voxel:.4g}"
         )
+    return mesh
 
 
 def _typical_depth(gaussians: Gaussians, views: list[View], options: RasterOptions) -> float:

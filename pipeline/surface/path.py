@@ -1,4 +1,4 @@
-"""A smooth camera path through a scene, near where the photographs were taken."""
+"""Smooth camera paths through a scene, near where the photographs were taken."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.interpolate import BSpline
+from scipy.ndimage import gaussian_filter1d
 
+from pipeline.config.video import VideoExport
 from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix4
 from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
 
-FRAMES = 90
-FPS = 30
-#: Size of a frame over that of the views.
-SCALE = 0.5
 #: Cameras surround the subject if no gap in azimuth is wider than this, degrees.
-_CLOSED_GAP = 120.0
-#: Otherwise the path swings over this share of the cameras' range of azimuths...
+_CLOSED_GAP = 75.0
+#: Otherwise the orbit swings over this share of the cameras' range of azimuths...
 _SWING_SHARE = 0.8
 #: ...and over at least this many degrees.
 _MIN_SWING = 6.0
+#: The most control points of a path through the cameras per second: more show how a hand shakes.
+_CONTROLS_PER_SECOND = 2.0
+#: Number of samples between control points, from which the speed along the path is computed.
+_SAMPLES = 32
 
 
 class PathFile(JsonFile, JsonObject):
@@ -47,60 +50,68 @@ class PathFile(JsonFile, JsonObject):
     )
 
 
-def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
-    """``FRAMES`` cameras on a closed smooth path, at ``SCALE`` of the views' size.
+def camera_path(
+    views: Sequence[View], depth: float, up: Array, video: VideoExport
+) -> tuple[list[View], str]:
+    """The camera of each frame, and a few words about the path.
 
-    If the views look at a common subject, the path goes around it, at the distance and height of
-    the nearby cameras: a full circle if the cameras surround it, else back and forth. If not (a
-    room from inside, a walk), the path goes through the views in the order of their names.
+    An orbit goes around the subject, at the distance and height of the nearby cameras: a full
+    circle if the cameras surround it, else back and forth. The other path goes through the views in
+    the order of their names, at constant speed. With the path "auto", it is an orbit if most views
+    look at a common subject, and not if they look outwards or along a way.
 
     Args:
         views: At least one view.
         depth: The typical distance of the scene from the cameras, world units.
         up: (3,) unit vector, up in the world.
     """
+    count = video.num_frames
     centres = np.stack([view.centre for view in views])
     forward = np.stack([view.world_to_camera[2, :3] for view in views])
     focus = _focus(centres, forward, depth)
-    to_focus = focus - centres
-    to_focus /= np.maximum(np.linalg.norm(to_focus, axis=1, keepdims=True), 1e-12)
-    if float(np.median((to_focus * forward).sum(axis=1))) > np.cos(np.radians(30)):
-        positions = _around(centres - focus, up) + focus
-        ahead = focus - positions
+    common = float(np.median((_unit(focus - centres) * forward).sum(axis=1))) > np.cos(
+        np.radians(30)
+    )
+    if video.path == "orbit" or (video.path == "auto" and common):
+        offsets, words = _around(centres - focus, up, count)
+        positions, ahead = offsets + focus, -offsets
     else:
-        positions, ahead = _smooth(centres), _smooth(forward)
-    frame = _frame(views)
-    return [
+        controls = round(video.seconds * _CONTROLS_PER_SECOND)
+        positions, ahead = _through(centres, forward, depth, controls, count)
+        words = "through the cameras in the order of their names"
+    frame = _frame(views, video.long_side_px)
+    path = [
         replace(frame, name=f"{i:04d}", world_to_camera=_look_along(p, d, up))
         for i, (p, d) in enumerate(zip(positions, ahead, strict=True))
     ]
+    return path, words
 
 
-def describe_path(path: Sequence[View]) -> PathFile:
+def describe_path(path: Sequence[View], fps: int) -> PathFile:
     """The content of ``path.json``."""
     first = path[0]
     return PathFile(
         convention="world to camera, 4x4 by rows; x right, y down, z forward; pixel centres at "
         "half integers; unit and frame of sparse/0",
-        fps=FPS,
+        fps=fps,
         **{name: getattr(first, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         world_to_camera=tuple(view.world_to_camera.tolist() for view in path),
     )
 
 
 def _focus(centres: Array, forward: Array, depth: float) -> Array:
-    """The point nearest to all optical axes, with a weak prior at the typical depth, which decides
-    if the axes are parallel."""
-    expected = (centres + depth * forward).mean(axis=0)
+    """The point nearest to all optical axes, and as near to what they show at the typical depth:
+    axes of photographs from one side cross at the background as well as at the subject."""
+    seen = centres + depth * forward
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    system = across.mean(axis=0) + 0.05 * np.eye(3)
-    right = (across * centres[:, None, :]).sum(axis=2).mean(axis=0) + 0.05 * expected
+    system = across.mean(axis=0) + np.eye(3)
+    right = (across * centres[:, None, :]).sum(axis=2).mean(axis=0) + seen.mean(axis=0)
     return np.asarray(np.linalg.solve(system, right))
 
 
-def _around(offsets: Array, up: Array) -> Array:
-    """(FRAMES, 3) positions around the origin. In cylindrical coordinates about ``up``, distance
-    and height are smooth functions of the azimuth, fitted to the cameras."""
+def _around(offsets: Array, up: Array, count: int) -> tuple[Array, str]:
+    """(count, 3) positions around the origin, and a few words. In cylindrical coordinates about
+    ``up``, distance and height are smooth functions of the azimuth, fitted to the cameras."""
     side, front = _horizontal_axes(up, offsets)
     azimuth = np.arctan2(offsets @ front, offsets @ side)
     height = offsets @ up
@@ -108,22 +119,24 @@ def _around(offsets: Array, up: Array) -> Array:
     order = np.sort(azimuth)
     gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
     widest = int(gaps.argmax())
-    phase = 2 * np.pi * np.arange(FRAMES) / FRAMES
+    phase = 2 * np.pi * np.arange(count) / count
+    terms: list[Any]
     if gaps[widest] < np.radians(_CLOSED_GAP):
-        angles, local = phase + order[0], azimuth
+        middle, angles, local = 0.0, phase + order[0], azimuth
         terms = [np.ones_like, np.cos, np.sin]
+        words = "a full circle around the subject"
     else:
         span = 2 * np.pi - gaps[widest]
         middle = order[(widest + 1) % len(order)] + span / 2
-        swing = max(_SWING_SHARE * span, np.radians(_MIN_SWING)) / 2
+        swing = max(_SWING_SHARE * span, np.radians(_MIN_SWING))
         local = (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
-        angles = swing * np.sin(phase)
+        angles = swing / 2 * np.sin(phase)
         terms = [np.ones_like, lambda a: a, lambda a: a * a]
-    fitted = [_fit(terms, local, values, angles) for values in (radius, height)]
-    if gaps[widest] >= np.radians(_CLOSED_GAP):
-        angles = angles + middle
+        words = f"back and forth over {np.degrees(swing):.0f}° around the subject"
+    radii, heights = (_fit(terms, local, values, angles) for values in (radius, height))
+    angles = angles + middle
     flat = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * front
-    return np.asarray(fitted[0][:, None] * flat + fitted[1][:, None] * up)
+    return np.asarray(radii[:, None] * flat + heights[:, None] * up), words
 
 
 def _fit(terms: list[Any], at: Array, values: Array, query: Array) -> Array:
@@ -149,16 +162,38 @@ def _horizontal_axes(up: Array, offsets: Array) -> tuple[Array, Array]:
     raise ValueError("up must be a unit vector")
 
 
-def _smooth(values: Array) -> Array:
-    """(FRAMES, 3) positions along the polygon ``values``, back and forth, smoothed by Gaussian."""
-    there_and_back = np.concatenate([values, values[-2:0:-1]]) if len(values) > 2 else values
-    count = len(there_and_back)
-    place = np.arange(FRAMES) * count / FRAMES
-    apart = np.abs(place[:, None] - np.arange(count))
-    apart = np.minimum(apart, count - apart)
-    # Wide enough to remove hand shake, and never narrower than the spacing of the frames.
-    weight = np.exp(-0.5 * (apart / max(1.5, count / FRAMES)) ** 2)
-    return np.asarray(weight @ there_and_back / weight.sum(axis=1, keepdims=True))
+def _through(
+    centres: Array, forward: Array, depth: float, controls: int, count: int
+) -> tuple[Array, Array]:
+    """(count, 3) positions and directions on cubic B-splines near the cameras, from the first to
+    the last one. The speed, of the picture's motion at ``depth``, is constant."""
+    centres, forward = (_thinned(values, max(controls, 4)) for values in (centres, forward))
+    degree = min(3, len(centres) - 1)
+    inner = np.linspace(0.0, 1.0, len(centres) - degree + 1)
+    knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])
+    curve = BSpline(knots, np.concatenate([centres, forward], axis=1), degree)
+    samples = np.linspace(0.0, 1.0, _SAMPLES * len(centres) + 1)
+    position, ahead = np.split(curve(samples), 2, axis=1)
+    moved = np.linalg.norm(np.diff(position, axis=0), axis=1) / depth
+    turned = np.linalg.norm(np.diff(_unit(ahead), axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(moved + turned)])
+    at = np.interp(np.linspace(0.0, way[-1], count), way, samples)
+    position, ahead = np.split(curve(at), 2, axis=1)
+    return position, _unit(ahead)
+
+
+def _thinned(values: Array, count: int) -> Array:
+    """At most ``count`` rows, evenly spaced in a smoothed copy of more of them."""
+    if len(values) <= count:
+        return values
+    smoothed = gaussian_filter1d(values, 0.5 * len(values) / count, axis=0, mode="nearest")
+    places = np.linspace(0, len(values) - 1, count)
+    rows = np.arange(len(values))
+    return np.stack([np.interp(places, rows, column) for column in smoothed.T], axis=1)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 def _look_along(position: Array, ahead: Array, up: Array) -> Array:
@@ -174,12 +209,14 @@ def _look_along(position: Array, ahead: Array, up: Array) -> Array:
     return pose
 
 
-def _frame(views: Sequence[View]) -> View:
-    """A view of the most common size at ``SCALE``, with the median focal length, even sides (video
-    encoders require them) and a centred principal point."""
+def _frame(views: Sequence[View], long_side: int | None) -> View:
+    """A view of the most common size, or with this longer side, with the median focal length, even
+    sides (video encoders require them) and a centred principal point."""
     size = Counter((view.width, view.height) for view in views).most_common(1)[0][0]
     alike = [view for view in views if (view.width, view.height) == size]
-    width, height = (max(2, 2 * round(side * SCALE / 2)) for side in size)
+    scale = 1.0 if long_side is None else long_side / max(size)
+    # Down to even: no frame is larger than the views unless it is to be.
+    width, height = (max(2, 2 * int(side * scale / 2 + 1e-9)) for side in size)
     focal = float(np.median([view.fx / view.width for view in alike])) * width
     return replace(
         alike[0],
@@ -190,4 +227,5 @@ def _frame(views: Sequence[View]) -> View:
         cx=width / 2,
         cy=height / 2,
         is_test=True,
+        crop=None,
     )

@@ -2,72 +2,98 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-Frames = Sequence[NDArray[np.uint8]]
+from pipeline.runtime.errors import UserError
 
+Frames = Iterable[NDArray[np.uint8]]
 
-def write_video(folder: Path, frames: Frames, fps: int) -> Path:
-    """Write ``video.mp4``, in H.264 if ffmpeg is on the PATH, else in VP9 by OpenCV; without
-    either, an animated ``video.webp``. Returns the file.
+H264 = "H.264"
+VP9 = "VP9; with ffmpeg on the PATH it is H.264, which more programs play"
 
-    Args:
-        frames: (H, W, 3) uint8 RGB, all of one size with even sides.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, encode in (("mp4", _ffmpeg), ("mp4", _opencv), ("webp", _pillow)):
-        path = folder / f"video.{name}"
-        temporary = folder / f".video.{os.getpid()}.{name}"
-        try:
-            if encode(temporary, frames, fps) and temporary.stat().st_size > 0:
-                os.replace(temporary, path)
-                return path
-        finally:
-            temporary.unlink(missing_ok=True)
-    raise OSError("no encoder could write the video")
+# The matrix and range that players assume for videos of today. A browser takes the matrix of an
+# older standard if not all three tags are there.
+_COLORS = (
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1"
+)
 
 
-def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
+def find_h264() -> str | None:
+    """The path of an ffmpeg that encodes H.264; None without one."""
     program = shutil.which("ffmpeg")
     if program is None:
-        return False
-    height, width = frames[0].shape[:2]
-    # Use one thread and no version strings: the same frames give the same bytes.
+        return None
+    command = [program, "-hide_banner", "-encoders"]
+    listed = subprocess.run(command, capture_output=True, text=True, check=False)
+    return program if " libx264 " in listed.stdout else None
+
+
+def write_video(path: Path, frames: Frames, size: tuple[int, int], fps: int) -> str:
+    """Write an MP4 file, frame by frame: the same frames give the same bytes.
+
+    Args:
+        frames: (H, W, 3) uint8 RGB.
+        size: The even width and height of the frames.
+
+    Returns:
+        The encoding: ``H264`` if ffmpeg is on the PATH, else ``VP9``, by OpenCV.
+
+    Raises:
+        UserError: No encoder is available, or it fails.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    program = find_h264()
+    if program is None:
+        _opencv(path, frames, size, fps)
+        return VP9
+    _ffmpeg(program, path, frames, size, fps)
+    return H264
+
+
+def _ffmpeg(program: str, path: Path, frames: Frames, size: tuple[int, int], fps: int) -> None:
+    # With one thread and without version strings, the bytes depend on the frames alone.
     command = [
         *(program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
-        *("-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-an"),
-        *("-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-threads", "1"),
+        *("-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-", "-an", "-vf", _COLORS),
+        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-threads", "1"),
         *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-movflags", "+faststart", str(path)),
     ]
-    data = b"".join(frame.tobytes() for frame in frames)
-    done = subprocess.run(command, input=data, capture_output=True, check=False)
-    return done.returncode == 0 and path.exists()
+    with TemporaryFile() as messages:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages) as encoder:
+            assert encoder.stdin is not None
+            try:
+                for frame in frames:
+                    encoder.stdin.write(np.ascontiguousarray(frame).data)
+                encoder.stdin.close()
+            except BrokenPipeError:
+                pass  # It has ended, and its messages say why.
+        messages.seek(0)
+        said = messages.read().decode(errors="replace").strip()
+    if encoder.returncode != 0:
+        raise UserError(
+            f"expected ffmpeg to encode the video, found: {said or encoder.returncode}",
+            file=program,
+            fix="install another ffmpeg, or leave video out of export.formats",
+        )
 
 
-def _opencv(path: Path, frames: Frames, fps: int) -> bool:
-    height, width = frames[0].shape[:2]
+def _opencv(path: Path, frames: Frames, size: tuple[int, int], fps: int) -> None:
     # Avoid WebM, which contains a random number: the same frames give the same bytes.
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), fps, size)
     if not writer.isOpened():
-        return False
+        raise UserError(
+            "no program is found that encodes videos: OpenCV was built without VP9",
+            fix="install ffmpeg, or leave video out of export.formats",
+        )
     for frame in frames:
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
     writer.release()
-    return path.exists()
-
-
-def _pillow(path: Path, frames: Frames, fps: int) -> bool:
-    pictures = [Image.fromarray(frame) for frame in frames]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0, quality=80
-    )
-    return True

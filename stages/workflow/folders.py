@@ -11,6 +11,10 @@ from stages.workflow.internals import prepare_folder
 _FIX = "make it writable, or run in another folder (snakemake --directory)"
 
 
+RESULTS = Path("results")
+"""The folder of all results, in the working directory."""
+
+
 def check_writable(folder: Path) -> None:
     """Check that a run's folder of results, which may not exist yet, can be written.
 

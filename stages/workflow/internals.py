@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import re
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from snakemake.logging import DefaultFormatter, get_event, logger
+from snakemake.logging import get_event, logger
 from snakemake.persistence import PersistenceBase
+from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
-
-from pipeline.runtime.errors import EXIT_USER_ERROR
 
 # --- the run ------------------------------------------------------------------------------------
 
@@ -51,6 +51,26 @@ class Flow:
         return bool(flow.is_main_process and flow.executor_plugin and not flow.dryrun)
 
     @property
+    def is_shown(self) -> bool:
+        """Whether this Snakemake shows a run to a user, and is not in a job of another."""
+        return bool(self._workflow.is_main_process)
+
+    @property
+    def shows_logs(self) -> bool:
+        """The value of ``--show-failed-logs``."""
+        return bool(self._workflow.output_settings.show_failed_logs)
+
+    @property
+    def is_verbose(self) -> bool:
+        """The value of ``--verbose``."""
+        return bool(self._workflow.output_settings.verbose)
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether ``--quiet all`` is given."""
+        return "ALL" in {about.name for about in self._workflow.output_settings.quiet or ()}
+
+    @property
     def cores(self) -> int:
         """The number of cores of this machine that jobs may use; not with a cluster."""
         return int(self._workflow.cores)
@@ -78,6 +98,24 @@ class Flow:
     def needed_jobs(self) -> list[Any]:
         """The jobs that will run."""
         return list(self._workflow.dag.needrun_jobs())
+
+    def targets(self) -> list[str]:
+        """The files that were asked for."""
+        files = [job.output or job.input for job in self._workflow.dag.targetjobs]
+        return sorted(str(file) for outputs in files for file in outputs)
+
+    def cause(self, job: Any) -> str:
+        """Why a job that has a result runs again; empty if it has none, or only because others run
+        before it."""
+        reason = self._workflow.dag.reason(job)
+        causes = {
+            "forced": "its result is not current",
+            "params_changed": "options changed",
+            "code_changed": "the program changed",
+            "updated_input": "an input is newer",
+        }
+        found = [text for name, text in causes.items() if getattr(reason, name)]
+        return found[0] if found and not reason.missing_output else ""
 
     def unlimit_rate(self) -> None:
         """Start jobs at any rate: Snakemake's limiter uses a considerable share of a core after
@@ -175,45 +213,113 @@ _TERMINAL = "DefaultStreamHandler"
 _COMMAND_FAILED = "CalledProcessError in file "
 # Python's sentences about a command that failed. They follow the command.
 _END = re.compile(r"(returned non-zero exit status (\d+)|died with <Signals\.\w+: (\d+)>)\.$", re.M)
-_SIGKILL = 9
+_SIGKILL, _SIGINT = 9, 2
 _DISK_FULL = f"[Errno {errno.ENOSPC}]"
+_NOTHING_TO_DO = "Nothing to be done"
+_CANCELLED = "Terminating processes on user request"
+# Messages before the first job that have no event, and those after a failed job, whose error the
+# display has shown.
+_ROUTINE = (
+    *("Building DAG of jobs", "Assuming unrestricted shared", "Using shell:", "Group jobs:"),
+    "Config file ",
+)
+_AFTER_FAILURE = (
+    "Exiting because a job execution failed",
+    "WorkflowError:\nAt least one job did not complete successfully",
+)
 
 
-def shorten_failures() -> None:
-    """Leave the commands of failed jobs, and tracebacks about Snakemake's log file on a full disk,
-    out of what Snakemake prints on the terminal.
+INTERRUPTED = "it was interrupted"
 
-    A job's command contains the stage's key or the whole plan, and Snakemake prints it twice after
-    the job's own message. Snakemake's log file still has both.
+
+class Listener(Protocol):
+    """Receives the events of a run."""
+
+    def dry_run(self) -> None:
+        """The jobs that a dry run would run are known."""
+
+    def nothing_to_do(self, dry_run: bool) -> None:
+        """No job has to run."""
+
+    def poll(self) -> None:
+        """A job has ended."""
+
+    def job_failed(self, log: Path, end: str) -> None:
+        """A job with this log has failed. ``end`` says how its command ended; it may be empty."""
+
+    def cancelled(self) -> None:
+        """Ctrl-C was pressed."""
+
+    def message(self, text: str) -> None:
+        """Snakemake has a message for the user."""
+
+
+class RunHandler(LogHandlerBase):
+    """A logger plugin's handler, which passes on what a user must be told of a run.
+
+    Snakemake's other messages are in its log file.
+    """
+
+    writes_to_stream = True
+    writes_to_file = False
+    has_filter = True
+    has_formatter = True
+    needs_rulegraph = False
+
+    def __init__(self, settings: Any, listener: Listener):
+        super().__init__(settings, None)
+        self._listener = listener
+        self._end = ""
+        self._knows_jobs = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        event, text = get_event(record), str(record.msg)
+        dry_run = bool(self.common_settings.dryrun)
+        if event is LogEvent.RUN_INFO:
+            if dry_run and not self._knows_jobs:
+                self._listener.dry_run()
+            self._knows_jobs = True
+        elif event is LogEvent.JOB_FINISHED:
+            self._listener.poll()
+        elif event is LogEvent.JOB_ERROR:
+            for log in record.__dict__["log"]:
+                self._listener.job_failed(Path(log), self._end)
+        elif (end := _command_end(record)) is not None:
+            self._end = end
+        elif text.startswith(_NOTHING_TO_DO):
+            self._listener.nothing_to_do(dry_run)
+        elif record.levelno >= logging.WARNING:
+            if not text.startswith(_AFTER_FAILURE) and event is not LogEvent.GROUP_ERROR:
+                full = _DISK_FULL in text
+                short = "Snakemake cannot write its own files: the disk is full"
+                self._listener.message(short if full else text)
+        elif text.startswith(_CANCELLED):
+            self._listener.cancelled()
+        elif event is None and not self._knows_jobs and not text.startswith(_ROUTINE):
+            self._listener.message(text)
+
+
+def listen(workflow: Any, listener: Listener) -> None:
+    """Pass on to ``listener`` what a user must be told. Snakemake prints only with ``--verbose``.
+
+    Tracebacks about Snakemake's log file on a full disk are left out.
     """
     logging.raiseExceptions = False
-    for handler in logger.handlers:
-        if handler.name == _TERMINAL and type(handler.formatter) is DefaultFormatter:
-            usual = handler.formatter
-            handler.setFormatter(_ShortFormatter(usual.quiet, usual.show_failed_logs))
-            handler.addFilter(_has_news)
+    settings = workflow.output_settings
+    for handler in [found for found in logger.handlers if found.name == _TERMINAL]:
+        if not settings.verbose:
+            logger.removeHandler(handler)
+        logger.addHandler(RunHandler(settings, listener))
 
 
-class _ShortFormatter(DefaultFormatter):
-    """Snakemake's format without the commands of failed jobs."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        if record.levelno >= logging.WARNING and _DISK_FULL in str(record.msg):
-            return "Snakemake cannot write its own files: the disk is full"
-        return _command_end(record) or super().format(record)
-
-    def format_job_error(self, msg: dict[str, Any]) -> str:
-        # Snakemake prints "message: None" for rules without a message.
-        return super().format_job_error(msg | {"shellcmd": None, "msg": msg["rule_msg"]})
-
-
-def _has_news(record: logging.LogRecord) -> bool:
-    """Return False if Snakemake repeats that a job has ended with a message of its own."""
-    return not (_command_end(record) or "").endswith(f" {EXIT_USER_ERROR}")
+def log_file() -> str:
+    """The file with Snakemake's own messages; empty without one."""
+    files = (getattr(handler, "baseFilename", "") for handler in logger.handlers)
+    return next((os.path.relpath(file) for file in files if file), "")
 
 
 def _command_end(record: logging.LogRecord) -> str | None:
-    """A sentence about the end of a command that failed; None for a record of something else."""
+    """How a command that failed has ended; None for a record of something else."""
     text = str(record.msg)
     if get_event(record) is not LogEvent.ERROR or _COMMAND_FAILED not in text:
         return None
@@ -221,5 +327,8 @@ def _command_end(record: logging.LogRecord) -> str | None:
     if not ends:
         return None
     what, status, signal = ends[-1]
-    killed = _SIGKILL in (int(signal or 0), int(status or 0) - 128)
-    return f"A job's command {what}" + (": it was killed, as for want of memory" if killed else "")
+    number = int(signal or 0) or int(status or 0) - 128
+    if number == _SIGINT:
+        return INTERRUPTED
+    killed = number == _SIGKILL
+    return f"its command {what}" + (": it was killed, as for want of memory" if killed else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,20 @@ def error_in(log: Path, started: float) -> str:
         return ""
     _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
     return message.partition(": ")[2].rstrip() if found else ""
+
+
+def interrupted_at(log: Path, started: float) -> str | None:
+    """Where Ctrl-C has stopped a job since ``started``, such as " at step 702 of 1500" or empty;
+    None for a job that was not stopped."""
+    found = re.search(r"^\w+: stopped(| at .+)$", "\n".join(last_lines(log, started)), re.M)
+    return found and found[1]
+
+
+def last_lines(log: Path, started: float, number: int = 3) -> list[str]:
+    """The last lines of a log that was written since ``started``."""
+    if not _was_written(log, started):
+        return []
+    return [line for line in log.read_text().splitlines() if line.strip()][-number:]
 
 
 def _was_written(log: Path, started: float) -> bool:

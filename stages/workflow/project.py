@@ -17,16 +17,17 @@ from pipeline.config.runs import Run, all_runs, name_fault, parse_run
 from pipeline.config.schema import Config
 from pipeline.plan import duration, stage_memory
 from pipeline.plan.keys import stage_key, uses_gpu
-from pipeline.plan.plan import describe, input_folders, make_plan, plan_record
+from pipeline.plan.plan import input_folders, make_plan, plan_record
 from pipeline.plan.scan import scan
 from pipeline.plan.settle import PROCESSOR, Choice
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
 from pipeline.render.devices import check_device, choose_device
 from pipeline.reporting.batch import PUBLISHED
+from pipeline.reporting.headline import batch_lines
 from pipeline.runtime.atomic import write_json
-from pipeline.runtime.errors import UserError, as_user_error
-from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
+from pipeline.runtime.errors import EXIT_INTERRUPTED, UserError, as_user_error
+from pipeline.runtime.layout import PACKAGES, SCAN_CACHE, STAGE_OUTPUT
 from pipeline.runtime.lock import check_not_locked, lock_run, user_name
 from pipeline.runtime.record import (
     STAGE,
@@ -47,13 +48,13 @@ from stages.workflow.cluster import (
     largest_node,
     wait_for_earlier_jobs,
 )
+from stages.workflow.display import RunDisplay, show_run
 from stages.workflow.failures import reporting_errors
-from stages.workflow.folders import check_working_directory, check_writable
+from stages.workflow.folders import RESULTS, check_working_directory, check_writable
 from stages.workflow.internals import Flow, use_locks_of_runs
-from stages.workflow.outcomes import error_in, failed_job, outcome
+from stages.workflow.outcomes import failed_job, outcome
 from stages.workflow.registry import STAGES
 
-RESULTS = Path("results")
 # Written when runs of a batch failed. From then on it is an input of the tables, so that these are
 # made again after the next batch.
 FAILURES = RESULTS / ".failures.json"
@@ -80,12 +81,13 @@ class SnakemakeProject:
     Args:
         raw: Snakemake's ``config``.
         workflow: Snakemake's ``workflow``.
+        display: The display of this run.
 
     Raises:
         UserError: the configuration is not valid, before any job starts.
     """
 
-    def __init__(self, raw: Mapping[str, Any], workflow: Any):
+    def __init__(self, raw: Mapping[str, Any], workflow: Any, display: RunDisplay | None = None):
         self._raw = dict(raw)
         self._flow = Flow(workflow)
         self._started = time.time()
@@ -97,12 +99,12 @@ class SnakemakeProject:
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
-        self._root = Path(self._project.data_root)
+        self._display = display or show_run(workflow)
+        self._root = self._display.data_root = Path(self._project.data_root)
         for name in named:
             if name_fault(name) or not (self._root / name).is_dir():
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
-        self._described: dict[str, str] = {}
         self._lost: set[Path] = set()
         # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.
@@ -112,6 +114,10 @@ class SnakemakeProject:
         os.environ["PATH"] = os.pathsep.join(
             [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
         )
+        if self._flow.is_shown and not self._flow.is_verbose:
+            os.environ[STAGE_OUTPUT] = "log"
+        else:
+            os.environ.pop(STAGE_OUTPUT, None)
         # OpenMP threads that wait actively slow down other processes.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -273,10 +279,8 @@ class SnakemakeProject:
         plan = make_plan(found, config, STAGES, str(folder), self._device(config))
         if not self._is_on_cluster() and self._will_use_gpu(plan, name):
             check_device(config.train.device)
-        # Runs with the same plan are printed once.
-        first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
-        print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
+        self._display.planned(plan)
         return plan
 
     def _device(self, config: Config) -> Choice:
@@ -395,15 +399,18 @@ class SnakemakeProject:
             self._flow.watch(needed)
             wait_for_earlier_jobs(Path.cwd())
             compile_for_all_nodes()
+        self._display.start()
+
+    def after_success(self) -> None:
+        """Show the results."""
+        self._display.succeeded()
 
     def after_failure(self) -> None:
-        """Print the messages of the stages that failed, and write a batch's tables with the runs
-        that succeeded."""
-        for log in sorted(RESULTS.glob("*/logs/*.log")):
-            message = error_in(log, self._started)
-            if message:
-                run = log.parents[1].name
-                print(f"\nerror in {log.stem} of {run}: {message}", file=sys.stderr)
+        """Show where the run was stopped, or what is kept after errors, and write a batch's tables
+        with the runs that succeeded."""
+        if self._display.interrupted():
+            raise SystemExit(EXIT_INTERRUPTED)
+        self._display.failed()
         if "_batch" in self.__dict__:  # Computed only if the target needs all runs.
             runs, left_out = self._batch
             outcomes = [
@@ -415,8 +422,7 @@ class SnakemakeProject:
             lost = [ended for ended in outcomes if ended["status"] != "ok"]
             with reporting_errors("the batch's tables"):
                 write_json(FAILURES, {"at": self._started, "lost": lost})
-            said = f"\n{len(lost)} of {len(runs)} runs have no result: see {RESULTS}/index.html"
-            print(said, file=sys.stderr)
+            self._display.message("\n".join(batch_lines(RESULTS)))
 
     def _ended(self, run: Run) -> dict[str, Any]:
         """The outcome of a run of the batch."""

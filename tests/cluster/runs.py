@@ -199,7 +199,7 @@ class Training:
         return int(found[1])
 
     def saved_by_sigterm(self, job: str) -> int:
-        return self.step_in(job, r"terminated after (\d+) steps")
+        return self.step_in(job, r"stopped after (\d+) steps")
 
     def resumed_at(self, job: str) -> int:
         return self.step_in(job, r"training: resuming at (\d+)/")

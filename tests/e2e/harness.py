@@ -98,7 +98,12 @@ def start_snakemake(
 def snakemake(
     project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
-    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
+    """Run Snakemake in ``project`` to its end.
+
+    Returns:
+        The process: what it printed in ``stdout``, the logs that it wrote in ``stderr``.
+    """
+    before = time.time()
     done = subprocess.run(
         command(*args, config=config, cores=cores),
         cwd=project,
@@ -109,24 +114,32 @@ def snakemake(
         text=True,
         timeout=900,
     )
+    logs = [*project.glob(".snakemake/log/*.log"), *project.glob("results/*/logs/*.log")]
+    done.stderr = "".join(log.read_text() for log in logs if log.stat().st_mtime >= before)
     if check and done.returncode != 0:
         raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
     return done
 
 
 def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
-    """The names of the rules whose jobs were started, for one scene or for all."""
-    if scene is None:
-        return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
-    jobs = re.findall(
-        r"^(?:local)?rule (\w+):\n(?: .*\n)*? +wildcards: scene=(\S+)$", done.stdout, re.M
+    """The names of the rules whose jobs were started, or would be, for one scene or for all."""
+    planned = re.findall(r"^(\S+): would run (.*)$", done.stdout, re.M)
+    jobs = [
+        (re.sub(r"(_\d+)?( \(.*)?$", "", job), of) for of, all in planned for job in all.split(", ")
+    ]
+    jobs += re.findall(
+        r"^(?:local)?rule (\w+):\n(?: .*\n)*? +wildcards: scene=([^\s,]+)", done.stderr, re.M
     )
+    if scene is None:
+        return {rule for rule, _ in jobs} | {
+            *re.findall(r"^(?:local)?rule (\w+):", done.stderr, re.M)
+        }
     return {rule for rule, of in jobs if of == scene}
 
 
 def started(done: subprocess.CompletedProcess[str]) -> Counter[str]:
     """Rule -> number of its jobs that were started."""
-    return Counter(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+    return Counter(re.findall(r"^(?:local)?rule (\w+):", done.stderr, re.M))
 
 
 def start_and_kill(

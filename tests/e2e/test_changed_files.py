@@ -99,5 +99,5 @@ def test_a_damaged_record_is_one_clear_error(project):
     assert done.returncode != 0 and "Traceback" not in done.stdout
     assert "sfm/stage.json: cannot be read" in done.stdout
     done = snakemake(project, target, "--forcerun", "sfm", config=TINY)
-    assert "up to date, nothing to do" in done.stdout
+    assert "up to date, nothing to do" in done.stderr
     assert record.read_text() == whole

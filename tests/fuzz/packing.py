@@ -8,6 +8,8 @@ import struct
 import zipfile
 import zlib
 
+import zstandard
+
 
 def unpack_zip(data: bytes) -> bytes:
     """The members' bytes, each after its name and its length."""
@@ -30,6 +32,31 @@ def pack_zip(data: bytes) -> bytes:
 
 def pack_gzip(data: bytes) -> bytes:
     return gzip.compress(data, 1, mtime=0)
+
+
+def unpack_spz(data: bytes) -> bytes:
+    """Of SPZ version 4, the header, and the expanded streams, each after its length."""
+    count, (start,) = data[15], struct.unpack_from("<I", data, 16)
+    body, at = data[:32], start + 16 * count
+    for i in range(count):
+        (size,) = struct.unpack_from("<Q", data, start + 16 * i)
+        stream = zstandard.decompress(data[at : at + size])
+        body, at = body + struct.pack("<I", len(stream)) + stream, at + size
+    return body
+
+
+def pack_spz(data: bytes) -> bytes:
+    """The table has the sizes of the streams, and the last stream has what is left."""
+    table, streams, at = b"", b"", 32
+    last = min(data[15], 6) - 1 if len(data) > 15 else -1
+    for i in range(last + 1):
+        (size,) = struct.unpack("<I", data[at : at + 4].ljust(4, b"\0"))
+        part = data[at + 4 : at + 4 + size if i < last else None]
+        at += 4 + size
+        packed = zstandard.compress(part, 1)
+        table += struct.pack("<QQ", len(packed), len(part))
+        streams += packed
+    return data[:32] + table + streams
 
 
 def pack_png(data: bytes) -> bytes:

@@ -31,7 +31,16 @@ from pipeline.scene.views import View
 from tests.fuzz.clouds import CLOUDS
 from tests.fuzz.georeference import GEOREFERENCE
 from tests.fuzz.names import FOLDERS
-from tests.fuzz.packing import pack_glb, pack_gzip, pack_png, pack_zip, unpack_glb, unpack_zip
+from tests.fuzz.packing import (
+    pack_glb,
+    pack_gzip,
+    pack_png,
+    pack_spz,
+    pack_zip,
+    unpack_glb,
+    unpack_spz,
+    unpack_zip,
+)
 from tests.fuzz.pictures import PICTURES
 from tests.fuzz.poses import POSES
 from tests.fuzz.reader import Files, Reader, of_file, same
@@ -92,13 +101,13 @@ def read_colmap(folder: Path) -> object:
     return fit_to_photos(read_model(folder), by_name, str(folder))
 
 
-def gaussian_seeds(suffix: str) -> Callable[[], Sequence[Files]]:
+def gaussian_seeds(suffix: str, spz_version: int = 3) -> Callable[[], Sequence[Files]]:
     def make() -> Sequence[Files]:
         found = []
-        for degree in (0, 1, 3):
+        for degree in (3, 1, 0):
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / f"g{suffix}"
-                write_gaussians(file, sample(6, degree))
+                write_gaussians(file, sample(6, degree), spz_version=spz_version)
                 found.append({file.name: file.read_bytes()})
         return found
 
@@ -255,6 +264,7 @@ READERS: dict[str, Reader] = {
     "ply": Reader(gaussian_seeds(".ply"), read_any_gaussians),
     "ply-ascii": Reader(ascii_ply, read_any_gaussians),
     "spz": Reader(gaussian_seeds(".spz"), read_any_gaussians, gzip.decompress, pack_gzip),
+    "spz-zstd": Reader(gaussian_seeds(".spz", 4), read_any_gaussians, unpack_spz, pack_spz),
     "splat": Reader(gaussian_seeds(".splat"), read_any_gaussians),
     "glb": Reader(gaussian_seeds(".glb"), read_any_gaussians, unpack_glb, pack_glb),
     "npz": Reader(gaussian_seeds(".npz"), read_any_gaussians, unpack_zip, pack_zip),

@@ -120,7 +120,7 @@ def test_an_interrupted_stage_ends_without_a_traceback(tmp_path, capfd):
         raise KeyboardInterrupt
 
     assert run_stage(request(tmp_path), work) == EXIT_INTERRUPTED
-    assert capfd.readouterr().err == "work: interrupted\n"
+    assert capfd.readouterr().err == "work: stopped\n"
     assert not list((tmp_path / "results").rglob("half"))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.e2e import transcripts
 from tests.e2e.harness import (
     TINY,
     command,
@@ -62,13 +63,13 @@ def test_results_from_the_future_change_nothing(project, finished):
     later = time.time() + 10 * 86400
     os.utime(project / "results" / "tiny" / "undistort" / "stage.json", (later, later))
     done = snakemake(project, TARGET, config=TINY)
-    assert not rules_run(done) or "train: up to date, nothing to do" in done.stdout
+    assert not rules_run(done) or "train: up to date, nothing to do" in done.stderr
     assert metrics(project, "tiny") == metrics(finished, "tiny")
 
 
 def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project):
     (project / "results" / "tiny" / "train" / "stage.json").unlink()
-    progress = project / "results" / "tiny" / ".scratch" / "progress.json"
+    progress = project / "results" / "tiny" / ".scratch" / "progress" / "train.json"
     progress.unlink()
     long = TINY | {"train": TINY["train"] | {"steps": 50_000}}
     process = subprocess.Popen(
@@ -90,6 +91,7 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
     assert list(project.glob("results/tiny/.scratch/train/*/out"))
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=120)
-    assert process.returncode != 0
+    assert process.returncode == 130
+    transcripts.check("interrupted", said, lines=15)
     assert "Traceback" not in said, said
     assert not list(project.glob("results/tiny/.scratch/train/*/out"))

@@ -7,24 +7,25 @@ from __future__ import annotations
 import csv
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.io.gltf import half_turn
-from pipeline.io.splat_files import write_gaussians
-from pipeline.io.spz import write_spz
+from pipeline.io.splat_files import read_gaussians, write_gaussians
+from pipeline.io.spz import decode_spz, write_spz
+from pipeline.splats.axes import LUF, RUB
 from pipeline.splats.gaussians import Gaussians
+from tests.io.test_spz import OTHERS, axes_record, in_axes, with_extensions
 from tests.io.test_spz import OURS as SPZ
-from tests.splats.samples import Within, sample
+from tests.splats.samples import EXACT, Within, sample
 from tests.tools import need, need_package
 
 HERE = Path(__file__).parent / "independent"
 PACKAGES = json.loads((HERE / "package.json").read_text())["dependencies"]
 GSPLY = "0.4.6"
-EXACT = Within(1e-6, 1e-6, 1e-6, 0.05, 1e-6, 1e-6)
 #: splat-transform reads .splat rotations in steps of 1/127.5, the original viewer of 1/128.
 SPLAT = Within(0, 2e-6, 0.5001 / 255, 1.8, 0.5001 / 255 / 0.28209, 0)
 
@@ -54,12 +55,16 @@ def gaussians_of(columns: dict[str, Any]) -> Gaussians:
     return Gaussians.from_arrays(arrays | {"sh": sh})
 
 
-def splat_transform(source: Path) -> Gaussians:
-    """Read a file with splat-transform."""
+def splat_transform(*arguments: str | Path) -> None:
     needs_node("@playcanvas/splat-transform")
-    table = source.with_suffix(".csv")
     script = HERE / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
-    node(script, "-w", "-q", source, table)
+    node(script, "-w", "-q", *arguments)
+
+
+def read_by_splat_transform(source: Path) -> Gaussians:
+    """The Gaussians in the axes of PLY files."""
+    table = source.with_suffix(".csv")
+    splat_transform(source, table)
     with open(table, newline="") as file:
         rows = list(csv.DictReader(file))
     column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
@@ -81,34 +86,90 @@ def splat_transform(source: Path) -> Gaussians:
     )
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_niantics_library_reads_our_spz(tmp_path, degree) -> None:
+def read_by_niantic(*files: Path) -> list[tuple[Gaussians, dict[str, Any]]]:
+    """The Gaussians of each file in the axes of PLY files, and all that the library found."""
     needs_node("@adobe/spz")
-    write_spz(tmp_path / "a.spz", sample(300, degree), antialias=degree == 2)
-    found = json.loads(node(HERE / "read.mjs", tmp_path / "a.spz"))
-    assert found["shDegree"] == degree and found["antialiased"] == (degree == 2)
-    decoded = gaussians_of(
-        {
+    read = []
+    for found in json.loads(node(HERE / "read.mjs", "spz", *files)):
+        columns = {
             "means": np.reshape(found["positions"], (-1, 3)),
             "log_scales": np.reshape(found["scales"], (-1, 3)),
             "quats": np.reshape(found["rotations"], (-1, 4))[:, [3, 0, 1, 2]],
             "opacity_logits": [np.inf if a is None else a for a in found["alphas"]],
             "dc": np.reshape(found["colors"], (-1, 3)),
-            "higher": np.reshape(found["sh"], (300, -1)),
+            "higher": np.reshape(found["sh"], (len(found["alphas"]), -1)),
         }
-    )
-    SPZ.check(decoded, sample(300, degree))
+        read.append((gaussians_of(columns), found))
+    return read
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_splat_transform_reads_our_ply(tmp_path, degree) -> None:
-    write_gaussians(tmp_path / "a.ply", sample(50, degree))
-    EXACT.check(splat_transform(tmp_path / "a.ply"), sample(50, degree))
+@pytest.mark.parametrize("version", [3, 4])
+def test_niantics_library_reads_our_spz(tmp_path, version) -> None:
+    files = [tmp_path / f"{degree}.spz" for degree in range(4)]
+    for degree, file in enumerate(files):
+        write_spz(file, sample(300, degree), antialias=degree == 2, version=version)
+    for degree, (gaussians, found) in enumerate(read_by_niantic(*files)):
+        assert found["shDegree"] == degree and found["antialiased"] == (degree == 2)
+        SPZ.check(gaussians, sample(300, degree))
 
 
-def test_splat_transform_reads_our_splat(tmp_path) -> None:
-    write_gaussians(tmp_path / "a.splat", sample(300))
-    SPLAT.check(splat_transform(tmp_path / "a.splat"), sample(300).with_sh_degree(0))
+def test_niantics_library_agrees_on_the_axes_that_a_file_names(tmp_path) -> None:
+    files = {
+        tmp_path / f"{version}-{code}.spz": with_extensions(version, axes_record(code))
+        for version in (3, 4)
+        for code in range(9)
+    }
+    for file, data in files.items():
+        file.write_bytes(data)
+    for (gaussians, _), data in zip(read_by_niantic(*files), files.values(), strict=True):
+        replace(EXACT, opacity=0.004).check(gaussians, decode_spz(data))
+
+
+FILES = {"a.ply": (3, EXACT), "a.spz": (3, SPZ), "b.spz": (4, SPZ), "a.splat": (3, SPLAT)}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_splat_transform_reads_the_same_scene_from_our_files(tmp_path, name, degree) -> None:
+    version, within = FILES[name]
+    write_gaussians(tmp_path / name, sample(300, degree), spz_version=version)
+    expected = sample(300, degree).with_sh_degree(0 if name == "a.splat" else degree)
+    within.check(read_by_splat_transform(tmp_path / name), expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "within"),
+    [
+        ("b.spz", ["--spz-version", "3"], OTHERS),
+        ("b.spz", [], OTHERS),
+        ("b.ply", [], EXACT),
+        ("b.glb", [], replace(EXACT, log_scale=2e-6, opacity=2e-6)),
+    ],
+)
+def test_the_same_scene_is_read_from_files_of_splat_transform(
+    tmp_path, name, options, within
+) -> None:
+    write_gaussians(tmp_path / "a.ply", sample(300))
+    splat_transform(*options, tmp_path / "a.ply", tmp_path / name)
+    within.check(read_gaussians(tmp_path / name, []), sample(300))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz"])
+def test_a_scene_is_upright_in_supersplat(tmp_path, name) -> None:
+    """SuperSplat shows files in the space that splat-transform writes .glb files in: y up. The
+    first Gaussian is below the others."""
+    gaussians = sample(20, 0)
+    gaussians.means[0, 1] = 50.0
+    write_gaussians(tmp_path / name, gaussians)
+    splat_transform(tmp_path / name, tmp_path / "seen.glb")
+    heights = np.reshape(attributes(tmp_path / "seen.glb")["POSITION"], (-1, 3))[:, 1]
+    assert heights.argmin() == 0 and heights[0] == pytest.approx(-50, abs=1e-3)
+
+
+def attributes(file: Path) -> dict[str, Any]:
+    """The attributes of the primitive of a .glb file, as glTF Transform reads them."""
+    needs_node("@gltf-transform/core")
+    return json.loads(node(HERE / "read.mjs", "attributes", file))
 
 
 def test_khronos_validator_accepts_our_glb(tmp_path) -> None:
@@ -125,9 +186,8 @@ def test_khronos_validator_accepts_our_glb(tmp_path) -> None:
 @pytest.mark.parametrize("degree", range(4))
 def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
     """Attributes have the names and encodings of KHR_gaussian_splatting."""
-    needs_node("@gltf-transform/core")
     write_gaussians(tmp_path / "a.glb", sample(50, degree))
-    found = json.loads(node(HERE / "read.mjs", "attributes", tmp_path / "a.glb"))
+    found = attributes(tmp_path / "a.glb")
     assert found["MODE"] == 0, "points"
 
     def column(name: str, width: int) -> np.ndarray:
@@ -145,19 +205,21 @@ def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
             "higher": np.concatenate([sh[0][:, :0], *sh[1:]], axis=1),
         }
     )
-    # glTF is y up: rotated by 180 degrees about z.
-    Within(1e-6, 2e-6, 2e-6, 0.05, 1e-6, 1e-6).check(half_turn(decoded), sample(50, degree))
+    within = replace(EXACT, log_scale=2e-6, opacity=2e-6)
+    within.check(in_axes(decoded, LUF), sample(50, degree))
 
 
-@pytest.mark.parametrize(("suffix", "within"), [(".ply", EXACT), (".spz", SPZ)])
-def test_gsply_reads_our_files(tmp_path, suffix, within) -> None:
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "b.spz"])
+def test_gsply_reads_our_files(tmp_path, name) -> None:
+    """It does not convert the axes of SPZ files."""
     need_package("gsply", GSPLY)
     import gsply
     from gsply.spz import read_spz
 
-    write_gaussians(tmp_path / f"a{suffix}", sample(300))
-    read = gsply.plyread if suffix == ".ply" else read_spz
-    found = read(str(tmp_path / f"a{suffix}"))
+    version, within = FILES[name]
+    write_gaussians(tmp_path / name, sample(300), spz_version=version)
+    is_spz = name.endswith(".spz")
+    found = (read_spz if is_spz else gsply.plyread)(str(tmp_path / name))
     decoded = gaussians_of(
         {
             "means": found.means,
@@ -168,4 +230,4 @@ def test_gsply_reads_our_files(tmp_path, suffix, within) -> None:
             "higher": found.shN.reshape(300, -1),
         }
     )
-    within.check(decoded, sample(300))
+    within.check(decoded, in_axes(sample(300), RUB if is_spz else (1, 1, 1)))

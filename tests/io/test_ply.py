@@ -124,6 +124,7 @@ def test_every_truncation_is_an_error_that_names_the_file(tmp_path: Path) -> Non
         (b"element vertex 2", b"element vertex -2", "element vertex"),
         (b"element vertex 2", b"element vertex two", "element vertex"),
         (b"element vertex 2", b"element face 2", "element vertex"),
+        (b"element vertex 2", b"element chunk 1\nelement vertex 2", "SuperSplat's compressed"),
         (b"property float opacity\n", b"", "no opacity"),
         (b"property float x\n", b"property float y\n", "y twice"),
         (b"property float x\n", b"property list uchar float x\n", "list"),

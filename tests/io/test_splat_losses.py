@@ -34,7 +34,7 @@ def through(way: str, tmp_path: Path, target: Path, gaussians: Gaussians) -> lis
         return [str(warning.message) for warning in caught]
     source, warnings = tmp_path / "source.npz", []
     write_gaussians(source, gaussians)
-    convert(source, target, 3, 0.0, False, warnings)
+    convert(source, target, 3, 0.0, False, 3, warnings)
     return warnings
 
 
@@ -85,7 +85,7 @@ def degree_four(flags: int) -> bytes:
 def test_what_is_not_read_of_an_spz_file_is_said(tmp_path: Path, flags: int) -> None:
     source, warnings = tmp_path / "s.spz", []
     source.write_bytes(degree_four(flags))
-    convert(source, tmp_path / "a.ply", 3, 0.0, False, warnings)
+    convert(source, tmp_path / "a.ply", 3, 0.0, False, 3, warnings)
     (said,) = warnings
     assert "s.spz: spherical harmonics of degree 4" in said
     assert ("extensions" in said) == bool(flags)
@@ -100,7 +100,7 @@ def test_what_a_format_holds_is_no_warning(tmp_path: Path, suffix: str) -> None:
 def test_opacity_compensation_is_kept_or_said(tmp_path: Path, suffix: str) -> None:
     source, target, warnings = tmp_path / "s.spz", tmp_path / f"a{suffix}", []
     write_spz(source, sample(40, 0), antialias=True)
-    convert(source, target, 3, 0.0, False, warnings)
+    convert(source, target, 3, 0.0, False, 3, warnings)
     assert len(read_gaussians(target, [])) == 40
     if suffix == ".spz":
         assert is_antialiased(target) and not warnings

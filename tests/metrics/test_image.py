@@ -1,4 +1,4 @@
-"""PSNR and SSIM agree with their definitions, and masked pixels are excluded."""
+"""PSNR, SSIM and FLIP agree with their definitions, and masked pixels are excluded."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from pipeline.metrics.flip import flip
 from pipeline.metrics.image import PSNR_CAP, psnr, ssim
 from pipeline.runtime.errors import UserError
 
@@ -85,6 +86,36 @@ def test_the_two_variants_differ() -> None:
     assert abs(ssim(image, reference) - ssim(image, reference, padding="valid")) > 1e-4
 
 
+def byte_pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    image, reference = (np.rint(255 * values).astype(np.uint8) for values in pair(height, width))
+    return image, reference
+
+
+def flat_pair(image: tuple[int, ...], reference: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    first, second = (np.tile(np.uint8(colour), (30, 40, 1)) for colour in (image, reference))
+    return first, second
+
+
+# flip_evaluator.evaluate(reference / 255, image / 255, "LDR")[1] of the authors' package 1.7. It
+# computes in float32, whose rounding makes features of equal pixels.
+@pytest.mark.parametrize(
+    ("pictures", "expected", "rounding"),
+    [
+        (byte_pair(37, 29), 0.154959, 2e-6),
+        (byte_pair(3, 50), 0.223961, 2e-6),
+        (byte_pair(90, 700), 0.149767, 2e-6),
+        (flat_pair((0, 0, 255), (0, 255, 0)), 1.0, 1e-6),
+        (flat_pair((255, 255, 255), (0, 0, 0)), 0.967397, 5e-5),
+        (flat_pair((200, 30, 90), (190, 60, 80)), 0.230343, 5e-5),
+    ],
+)
+def test_flip_equals_the_authors_program(pictures, expected: float, rounding: float) -> None:
+    image, reference = pictures
+    assert flip(image, reference) == pytest.approx(expected, abs=rounding)
+    assert flip(image / 255, reference / 255) == flip(image, reference)
+    assert flip(image, image) == 0.0
+
+
 unit = st.floats(0, 1, width=32)
 
 
@@ -102,6 +133,7 @@ def test_masked_pixels_have_no_influence(mask, junk, padding) -> None:
     assert ssim(other, reference, mask, padding=padding) == ssim(
         image, reference, mask, padding=padding
     )
+    assert flip(other, reference, mask) == flip(image, reference, mask)
 
 
 def test_masked_psnr_counts_only_unmasked_pixels() -> None:
@@ -109,6 +141,9 @@ def test_masked_psnr_counts_only_unmasked_pixels() -> None:
     mask = np.zeros(image.shape[:2], np.uint8)
     mask[:10, :7] = 255
     assert psnr(image, reference, mask) == pytest.approx(psnr(image[:10, :7], reference[:10, :7]))
+    assert flip(image, reference, mask) > 2 * flip(
+        np.where(mask[..., None] != 0, image, reference), reference
+    )
     everything = np.ones(image.shape[:2], bool)
     assert psnr(image, reference, everything) == pytest.approx(psnr(image, reference), abs=1e-12)
     assert ssim(image, reference, everything) == pytest.approx(ssim(image, reference), abs=1e-12)
@@ -117,7 +152,7 @@ def test_masked_psnr_counts_only_unmasked_pixels() -> None:
 def test_empty_masks_and_too_small_images_are_rejected() -> None:
     image, reference = pair(12, 12)
     nothing = np.zeros((12, 12), bool)
-    for measure in (psnr, ssim):
+    for measure in (psnr, ssim, flip):
         with pytest.raises(UserError, match="no pixel"):
             measure(image, reference, nothing)
     border_only = np.ones((12, 12), bool)
@@ -139,10 +174,12 @@ def test_shapes_must_agree() -> None:
 @pytest.mark.parametrize("padding", ["zero", "valid"])
 @pytest.mark.parametrize("masked", [False, True])
 def test_measures_do_not_depend_on_the_bands(monkeypatch, masked: bool, padding) -> None:
-    image, reference = (np.rint(255 * values).astype(np.uint8) for values in pair(101, 57))
+    image, reference = byte_pair(101, 57)
     mask = np.random.default_rng(1).random(image.shape[:2]) > 0.3 if masked else None
     whole = psnr(image / 255, reference / 255, mask), ssim(image, reference, mask, padding=padding)
+    whole_flip = flip(image, reference, mask)
     for pixels in (1, 57 * 13):
         monkeypatch.setattr("pipeline.metrics.image._BAND_PIXELS", pixels)
         assert psnr(image, reference, mask) == whole[0]
         assert ssim(image, reference, mask, padding=padding) == whole[1]
+        assert flip(image, reference, mask) == whole_flip

@@ -1,12 +1,21 @@
 """LPIPS equals the published network, and is unavailable without its weights."""
 
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from hashlib import sha256
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 
-from pipeline.metrics.lpips import LPIPS_VARIANTS, lpips_available
-from pipeline.runtime.errors import UserError
+from pipeline.command.main import main
+from pipeline.metrics import lpips
+from pipeline.metrics.lpips import FETCH, LPIPS_VARIANTS, lpips_available
+from pipeline.runtime.download import RemoteFile
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 # (index in torchvision's features, channels in, channels out, kernel)
 LAYERS = {
@@ -69,11 +78,82 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
-def test_missing_weights_are_reported_with_their_paths(checkpoints, net) -> None:
+def test_missing_weights_are_reported_with_the_command_that_downloads_them(
+    checkpoints, net
+) -> None:
+    save_weights(checkpoints, net)
+    (checkpoints / f"lpips_{net}.pth").unlink()
     measure, reason = lpips_available(net)
     assert measure is None
-    assert FILES[net] in reason and f"lpips_{net}.pth" in reason and "hub/checkpoints" in reason
+    assert reason.endswith(FETCH[net])
     assert str(checkpoints) not in reason, "a path of this machine would stand in metrics.json"
+
+
+@pytest.mark.parametrize("net", ["vgg", "alex"])
+def test_digests_are_those_in_the_names_of_torchvisions_files(net) -> None:
+    backbone = lpips._NETWORKS[net].backbone
+    assert backbone.url.endswith(backbone.name)
+    assert f"-{backbone.sha256[:8]}." in backbone.name and len(backbone.sha256) == 64
+
+
+@pytest.fixture
+def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A server's folder with small weights; those of VGG are expected to be these files."""
+    folder = tmp_path / "published"
+    folder.mkdir()
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    files = []
+    for name, data in (("vgg16-397923af.pth", bytes(2_500_000)), ("lpips_vgg.pth", b"heads")):
+        (folder / name).write_bytes(data)
+        url = f"http://127.0.0.1:{server.server_port}/{name}"
+        files.append(RemoteFile(name, url, len(data), sha256(data).hexdigest()))
+    network = replace(lpips._NETWORKS["vgg"], backbone=files[0], heads=files[1])
+    monkeypatch.setitem(lpips._NETWORKS, "vgg", network)
+    yield folder
+    server.shutdown()
+    server.server_close()
+
+
+def test_weights_are_downloaded_once_and_repaired(published, checkpoints, capsys) -> None:
+    (checkpoints / "vgg16-397923af.pth").write_bytes(b"cut off")
+    (checkpoints / "vgg.pth").write_bytes(b"another program's")
+    assert main(["fetch", "lpips"]) == 0
+    assert capsys.readouterr().out.count("downloaded from http") == 2
+    assert {path.name for path in checkpoints.iterdir()} == {
+        *("vgg16-397923af.pth", "lpips_vgg.pth", "vgg.pth")
+    }
+    for file in published.iterdir():
+        assert (checkpoints / file.name).read_bytes() == file.read_bytes()
+        file.unlink()
+    assert main(["fetch", "lpips"]) == 0
+    assert capsys.readouterr().out.count("was there") == 2
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"),
+    [
+        (bytes(2_499_999) + b"x", "2500000 bytes with the SHA-256 digest"),
+        (bytes(1_000), "found 1000 bytes"),
+        (bytes(9_000_000), "found more than 3000000 bytes"),
+        (None, "File not found"),
+    ],
+    ids=["other content", "cut off", "too long", "missing"],
+)
+def test_a_failed_download_leaves_no_file_and_says_why(
+    published, checkpoints, capsys, sent, words
+) -> None:
+    file = published / "vgg16-397923af.pth"
+    file.unlink() if sent is None else file.write_bytes(sent)
+    assert main(["fetch", "lpips"]) == EXIT_USER_ERROR
+    message = capsys.readouterr().err
+    assert words in message and "http://127.0.0.1" in message and "what to do" in message
+    assert list(checkpoints.iterdir()) == []
 
 
 def test_invalid_weight_files_are_reported(checkpoints) -> None:

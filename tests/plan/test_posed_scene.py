@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +19,10 @@ from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.record import StageRecord
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.georeference import CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
-from splatmake import UserError
+from splatmake import Scene, UserError
 from tests.plans import record_of
 from tests.splats.samples import sample
 
@@ -65,7 +68,11 @@ def error(folder: Path) -> str:
 
 def test_a_finished_scene_is_loaded(results: Path) -> None:
     scene = splatmake.load(results)
+    assert repr(scene) == "Scene('barn': 5 Gaussians, 3 views, 1 test)"
+    np.testing.assert_allclose(scene.up, (0, -1, 0), atol=1e-12)
     assert [view.name for view in scene.test_views] == ["0.png"] and len(scene.views) == 3
+    view = scene.view("1")
+    assert (scene.render(splatmake.Camera.of(view)).rgb == scene.render(view).rgb).all()
 
 
 @pytest.mark.parametrize(
@@ -115,3 +122,48 @@ def test_gains_of_other_views_are_one_error(results: Path) -> None:
 def test_a_missing_model_is_one_error(results: Path) -> None:
     (results / "train" / "gaussians.npz").unlink()
     assert "found no train/gaussians.npz" in error(results)
+
+
+def test_exports_are_in_the_unit_of_given_poses(results: Path, tmp_path: Path) -> None:
+    """A scene that was scaled for training renders the same from its exported files."""
+    Georeference(
+        method="given",
+        origin=CartesianOrigin(x=100, y=0, z=0),
+        residuals_m=None,
+        axes="",
+        unit="",
+        projection=None,
+        scale=10,
+        rotation=((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        translation=(-1000, 0, 0),
+        residuals=(),
+    ).write(results / "inspect")
+    scene = splatmake.load(results)
+    for suffix in (".ply", ".npz"):
+        file = tmp_path / f"a{suffix}"
+        scene.export(file, morton_order=False)
+        ratio = scene.gaussians.means / splatmake.read_gaussians(file).means
+        np.testing.assert_allclose(ratio, 10 if suffix == ".ply" else 1, rtol=1e-6)
+        again = splatmake.load(results, file)
+        for view in scene.views:
+            ours, theirs = scene.render(view), again.render(again.view(view.name))
+            assert ours.rgb.std() > 0
+            np.testing.assert_allclose(ours.rgb, theirs.rgb, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda scene: scene.export("a.obj"), "a.obj: expected a file of Gaussians"),
+        (lambda scene: scene.export("a.ply", sh_degree=4), "sh_degree: expected 0, 1, 2 or 3"),
+        (lambda scene: scene.export("a.ply", min_opacity=2), "min_opacity: expected 0 to 1"),
+        (lambda scene: scene.mesh("a.spz"), "a.spz: expected a mesh file"),
+        (lambda scene: scene.mesh("a.ply", voxel=0), "voxel: expected a length above 0"),
+        (lambda scene: scene.view("9"), "barn: expected a view named '9', found 3 others"),
+    ],
+)
+def test_a_wrong_argument_is_one_error(
+    call: Callable[[Scene], object], said: str, results: Path
+) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        call(splatmake.load(results))

@@ -29,6 +29,7 @@ from pipeline.plan.values import StagePlan
 from pipeline.reporting.data import (
     Comparison,
     CoverageSection,
+    Download,
     SceneResults,
     TrainedScene,
     TrainingRecord,
@@ -138,10 +139,11 @@ def coverage() -> CoverageSection:
 
 def evaluation(*views: ViewMetrics) -> Evaluation:
     """With the measures of these views; of one, without arguments."""
-    one = ViewMetrics(name="a.jpg", psnr=27.5, ssim=0.9, lpips=None, render="0.png")
+    one = ViewMetrics(name="a.jpg", psnr=27.5, ssim=0.9, flip=0.08, lpips=None, render="0.png")
     return Evaluation(
         psnr=27.5,
         ssim=0.9,
+        flip=0.08,
         lpips=None,
         lpips_reason="switched off",
         train_psnr=30.0,
@@ -180,6 +182,7 @@ def metrics(**changes) -> TimedMetrics:
         "device": "cpu",
         "psnr": 27.3456,
         "ssim": 0.87654,
+        "flip": 0.08765,
         "lpips": 0.12347,
         "lpips_reason": "",
         "num_gaussians": 123456,
@@ -201,8 +204,8 @@ def metrics(**changes) -> TimedMetrics:
             num_truth=49,
         ).model_dump(),
         "stages": {
-            "inspect": {"wall_s": 12.5, "cpu_s": 23.4, "peak_rss_mb": 345.0, "skipped": False},
             "decode": {"skipped": True},
+            "inspect": {"wall_s": 12.5, "cpu_s": 23.4, "peak_rss_mb": 345.0, "skipped": False},
             "train": {"wall_s": 14.5, "cpu_s": 25.4, "peak_rss_mb": 347.0, "skipped": False},
         },
         "versions": {"torch": "2.13.0"},
@@ -219,6 +222,13 @@ def sparse(xyz: np.ndarray, rgb: np.ndarray | None = None) -> Points:
     return Points.without_tracks(xyz, np.zeros(xyz.shape, np.uint8) if rgb is None else rgb)
 
 
+PLAN = {
+    "inspect": StagePlan(run=True, reason="49 photographs"),
+    "decode": StagePlan(run=False, reason="no RAW"),
+    "train": StagePlan(run=True, reason="200 steps", inputs=["inspect"]),
+}
+
+
 def report(**changes) -> SceneResults:
     rng = np.random.default_rng(0)
     photograph, render = rng.integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
@@ -227,7 +237,8 @@ def report(**changes) -> SceneResults:
     lengths = rng.integers(2, 9, 300)
     data = SceneResults(
         metrics=metrics(),
-        plan=record_of({"decode": StagePlan(run=False, reason="no RAW")}, ["it is dark"]),
+        plan=record_of(PLAN, ["it is dark"]),
+        downloads=[Download("export/scene.spz", 1_500_000)],
         decisions={"sfm": ["incremental mapper: 49 images"], "train": []},
         curve=[
             TrainingRecord(CurveRecord(step=100, loss=0.2345, psnr=17.89, num_gaussians=5001), 3.0),

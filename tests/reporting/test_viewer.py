@@ -1,8 +1,9 @@
-"""The page in a browser: no requests, renders as by our rasterizer, mouse and keyboard control."""
+"""The page in a browser: no requests, renders as by our rasterizer, mouse, touch and keyboard."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import re
 import shutil
@@ -16,13 +17,16 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.io.ply import write_splat_ply
+from pipeline.io.splat_files import write_gaussians
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
+from pipeline.splats.arrays import collect
+from pipeline.splats.axes import RUB, Flipped
 from pipeline.splats.gaussians import Gaussians
 from tests.reporting.made import gaussians, report, trained
+from tests.reporting.worlds import WORLDS, World
 from tests.tools import need_package
 
 FLAGS = (
@@ -54,8 +58,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """Small, because the browser renders on the CPU."""
-    with browser.new_context(viewport={"width": 480, "height": 400}) as context:
+    """Small, because the browser renders on the CPU; cameras are reached without a flight."""
+    size = {"width": 480, "height": 400}
+    with browser.new_context(viewport=size, reduced_motion="reduce") as context:
         context.set_default_timeout(1000 * SECONDS)
         yield context.new_page()
 
@@ -63,7 +68,12 @@ def page(browser: Any) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
-    write_report(report(trained=trained(gaussians=gaussians(1500))), path)
+    base = report(trained=trained(gaussians=gaussians(1500)))
+    red = np.full((150, 200, 3), (255, 0, 0), np.uint8)
+    shown = dataclasses.replace(
+        base.comparisons[0], label="median", name="2.jpg", photograph=red, mask=None
+    )
+    write_report(dataclasses.replace(base, comparisons=[shown, *base.comparisons]), path)
     return path
 
 
@@ -118,28 +128,36 @@ def test_the_scene_appears_without_network_requests(page: Any, file: Path) -> No
     until(lambda: len(np.unique(canvas(page).reshape(-1, 3), axis=0)) > 2000)
     assert [url for url in asked if not url.startswith((file.as_uri(), "blob:", "data:"))] == []
     assert said == []
-    assert not page.locator("#space p").is_visible()
+    assert not page.locator("#space .message").is_visible()
     assert page.locator("#space-tools select").is_enabled()
 
 
-@pytest.mark.parametrize(("kind", "antialias"), [("spz", False), ("spz", True), ("ply", False)])
+@pytest.mark.parametrize(
+    ("file", "antialias"), [(None, False), (None, True), ("scene.ply", False), ("scene.spz", False)]
+)
 def test_the_viewer_renders_as_our_rasterizer(
-    page: Any, tmp_path: Path, kind: str, antialias: bool
+    page: Any, tmp_path: Path, file: str | None, antialias: bool
 ) -> None:
-    """Spark's render of the page's SPZ, or of our PLY instead, against the rasterizer's."""
+    """Spark's render of the page, or of a file of ours in its place, against the rasterizer's.
+
+    Spark shows coordinates as they are in a file: y up for SPZ, y down for PLY.
+    """
     path = tmp_path / "report.html"
     scene = trained(gaussians=gaussians(3000), background=(0.2, 0.5, 1.0), antialias=antialias)
     write_report(report(trained=scene), path)
-    if kind == "ply":
-        write_splat_ply(tmp_path / "scene.ply", scene.gaussians)
-        ply = base64.b64encode((tmp_path / "scene.ply").read_bytes()).decode()
-        path.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, path.read_text("utf-8")), "utf-8")
+    shown = Gaussians.sharing(scene.gaussians)
+    if file is not None:
+        write_gaussians(tmp_path / file, shown)
+        text = base64.b64encode((tmp_path / file).read_bytes()).decode()
+        path.write_text(re.sub(r'(?<=id="splats">)[^<]+', text, path.read_text("utf-8")), "utf-8")
+    if file == "scene.spz":
+        shown = Gaussians.sharing(collect(Flipped(shown, RUB)))
     page.goto(path.as_uri())
     for view in scene.views[:3]:
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
         drawn = pixels(base64.b64decode(url.partition(",")[2]))
         options = RasterOptions(background=scene.background, antialias=antialias, near=scene.near)
-        ours = render_view(Gaussians.sharing(scene.gaussians), view, options).rgb
+        ours = render_view(shown, view, options).rgb
         assert drawn.shape == ours.shape
         psnr = -10 * np.log10(np.mean((drawn / 255 - np.rint(ours * 255) / 255) ** 2))
         assert psnr >= 38
@@ -174,12 +192,14 @@ def test_the_slider_moves_between_photograph_and_render(scene: Any) -> None:
 def test_views_cameras_and_points_can_be_chosen(scene: Any) -> None:
     first = settled(scene)
     tools = scene.locator("#space-tools")
-    assert tools.locator("select").input_value() == "2"
-    tools.get_by_role("button", name="next view").click()
-    assert tools.locator("select").input_value() == "3"
+    view = tools.locator("select")
+    assert view.input_value() == "2"
+    scene.get_by_role("button", name="next camera").click()
+    assert view.input_value() == "3" and scene.locator("#space .name").inner_text() == "3.jpg"
     changed(scene, first)
-    tools.locator("select").select_option("overview")
-    changed(scene, first)
+    scene.get_by_role("button", name="Reset").click()
+    assert view.input_value() == "2"
+    view.select_option("overview")
     afar = settled(scene)
     tools.get_by_label("Cameras").uncheck()
     changed(scene, afar)
@@ -192,33 +212,192 @@ def test_views_cameras_and_points_can_be_chosen(scene: Any) -> None:
     until(lambda: np.array_equal(canvas(scene), afar))
 
 
-def test_mouse_wheel_and_keys_turn_and_zoom(scene: Any) -> None:
-    still = settled(scene)
+def test_pyramids_are_drawn_at_a_camera_too(scene: Any) -> None:
+    """Those of the other cameras, however near they are."""
+    scene.get_by_role("button", name="next camera").click()  # Without a photograph over it.
+    bare = settled(scene)
+    scene.get_by_label("Cameras").check()
+    changed(scene, bare)
+
+
+def state(page: Any) -> dict[str, Any]:
+    return page.evaluate("viewer.state()")
+
+
+def test_the_wheel_is_the_pages_until_the_scene_is_clicked(scene: Any) -> None:
     scene.evaluate("document.getElementById('space').scrollIntoView({behavior: 'instant'})")
-    top = scene.evaluate("scrollY")
     area = scene.locator("#space canvas").bounding_box()
-    x, y = area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
+    x, y = area["x"] + area["width"] / 4, area["y"] + area["height"] / 4
+
+    def wheel(*, scrolls: bool) -> None:
+        top, pose = scene.evaluate("scrollY"), state(scene)["pose"]
+        scene.mouse.wheel(0, 30)
+        if scrolls:
+            until(lambda: scene.evaluate("scrollY") > top)
+        else:
+            until(lambda: state(scene)["pose"] != pose)
+        assert (scene.evaluate("scrollY") > top, state(scene)["pose"] != pose) == (
+            scrolls,
+            not scrolls,
+        )
+
     scene.mouse.move(x, y)
-    scene.mouse.wheel(0, 40)
-    until(lambda: scene.evaluate("scrollY") > top)  # the page's, until the scene is clicked
+    wheel(scrolls=True)
+    scene.keyboard.down("Control")
+    wheel(scrolls=False)
+    scene.keyboard.up("Control")
+    scene.mouse.click(x, y)
+    assert state(scene)["active"]
+    wheel(scrolls=False)
+    scene.keyboard.press("Escape")
+    wheel(scrolls=True)
+    scene.mouse.click(x, y)
+    scene.get_by_role("button", name="Done").click()
+    scene.mouse.move(x, y)
+    wheel(scrolls=True)
+
+
+def test_keys_walk_turn_zoom_and_reset(scene: Any) -> None:
+    start = state(scene)
+    scene.locator("#space canvas").focus()
+    for key, current in [("ArrowRight", 3), ("ArrowLeft", 2), ("ArrowLeft", 1), ("Home", 2)]:
+        scene.keyboard.press(key)
+        assert state(scene)["current"] == current
+    assert state(scene) == start
+    for key in ("Shift+ArrowLeft", "Shift+ArrowUp", "ArrowUp", "-"):
+        before = state(scene)["pose"]
+        scene.keyboard.press(key)
+        assert state(scene)["pose"] != before, key
+
+
+def test_the_divider_in_the_viewer_uncovers_the_render(scene: Any) -> None:
+    """The photograph is red, lies over its camera's image, and goes when the view turns."""
+    slider = scene.locator("#space .photograph input")
+
+    def reds() -> Pixels:
+        return (settled(scene) == (255, 0, 0)).all(2)
+
+    half = reds()
+    left, right = np.array_split(half, 2, axis=1)
+    assert left.mean() > 0.5 and right.mean() < 0.1
+    slider.focus()
+    scene.keyboard.press("End")
+    assert reds().mean() > 0.8
+    area = scene.locator("#space").bounding_box()
+    x, y = area["x"] + area["width"] / 4, area["y"] + area["height"] / 4
+    scene.mouse.move(x, y)
     scene.mouse.down()
-    scene.mouse.move(x + 60, y + 10, steps=3)
+    scene.mouse.move(x + 20, y, steps=2)
     scene.mouse.up()
-    changed(scene, still)
-    turned = settled(scene)
-    top = scene.evaluate("scrollY")
-    scene.mouse.wheel(0, 200)
-    changed(scene, turned)
-    assert scene.evaluate("scrollY") == top
-    zoomed = settled(scene)
-    scene.keyboard.press("ArrowLeft")
-    changed(scene, zoomed)
+    assert state(scene)["photograph"] is None and not reds().any()
+    scene.get_by_role("button", name="Reset").click()
+    assert state(scene)["photograph"] == "2.jpg"
+
+
+def test_one_finger_scrolls_the_page_until_the_scene_is_tapped(browser: Any, file: Path) -> None:
+    size = {"width": 390, "height": 700}
+    with browser.new_context(
+        viewport=size, has_touch=True, is_mobile=True, reduced_motion="reduce"
+    ) as context:
+        context.set_default_timeout(1000 * SECONDS)
+        page = context.new_page()
+        page.goto(file.as_uri())
+        page.evaluate("viewer.ready")
+        page.evaluate(
+            "document.getElementById('space').scrollIntoView("
+            "{block: 'center', behavior: 'instant'})"
+        )
+        touch = context.new_cdp_session(page)
+
+        def swipe() -> tuple[bool, bool]:
+            """Up across the scene: whether the page scrolled, and whether the view turned."""
+            area = page.locator("#space").bounding_box()
+            top, pose = page.evaluate("scrollY"), state(page)["pose"]
+            where = {"x": area["x"] + 60, "y": area["y"] + area["height"] / 2}
+            gesture = {"yDistance": -80, "gestureSourceType": "touch", "preventFling": True}
+            touch.send("Input.synthesizeScrollGesture", where | gesture)
+            return page.evaluate("scrollY") > top, state(page)["pose"] != pose
+
+        assert swipe() == (True, False)
+        area = page.locator("#space").bounding_box()
+        page.touchscreen.tap(area["x"] + 60, area["y"] + area["height"] / 2)
+        until(lambda: state(page)["active"])
+        assert swipe() == (False, True)
+        page.get_by_role("button", name="Done").tap()
+        assert swipe() == (True, False)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+
+
+GESTURES = Path(__file__).with_name("gestures.js").read_text("utf-8")
+Random = np.random.Generator
+
+
+def gesture(rng: Random) -> dict[str, Any]:
+    """A gesture on the canvas: its kind, and numbers between -1 and 1."""
+    kinds = ("drag", "drag", "pan", "wheel", "swipe", "tap", "double", "key")
+    return {"kind": str(rng.choice(kinds)), "values": rng.uniform(-1, 1, 6).round(4).tolist()}
+
+
+def load_world(page: Any, tmp_path: Path, world: World) -> None:
+    path = tmp_path / "report.html"
+    write_report(report(trained=world.scene), path)
+    page.goto(path.as_uri())
+    page.evaluate("viewer.ready")
+    page.evaluate(GESTURES)
+
+
+def in_world(page: Any, world: World, seen: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The viewpoint, and the depths of the subject's points that are in the canvas."""
+    data = page.evaluate("JSON.parse(document.getElementById('space-data').textContent).frame")
+    frame = np.linalg.inv(np.array(data).reshape(4, 4).T)
+    pose = frame @ np.array(seen["pose"]).reshape(4, 4).T
+    scale = np.cbrt(np.linalg.det(pose[:3, :3]))
+    local = (world.subject - pose[:3, 3]) @ (pose[:3, :3] / scale)
+    depth, tangent = -local[:, 2], np.tan(np.radians(seen["fov"]) / 2)
+    ahead = depth > 0.03
+    up, aside = (np.abs(local[ahead, axis]) / depth[ahead] / tangent for axis in (1, 0))
+    aspect = seen["aspect"]
+    return pose[:3, 3], depth[ahead][(up < 1) & (aside < aspect)]
+
+
+@pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)
+def test_no_gesture_loses_the_subject(page: Any, tmp_path: Path, world: World) -> None:
+    """200 random gestures: the subject stays in view at a sensible distance, the viewpoint where
+    photographs could have been taken, and no view is flat."""
+    load_world(page, tmp_path, world)
+    rng = np.random.default_rng(7)
+    for _ in range(4):
+        made = [gesture(rng) for _ in range(50)]
+        for done, seen in zip(made, page.evaluate("gestures => play(gestures)", made), strict=True):
+            viewpoint, depths = in_world(page, world, seen)
+            assert world.allows(viewpoint), (done, viewpoint)
+            assert len(depths) >= 0.04 * len(world.subject), (done, viewpoint)
+            assert 0.2 * world.distance < np.median(depths) < 1.8 * world.distance, done
+        picture = settled(page).reshape(-1, 3).astype(int)
+        common = np.median(picture, axis=0)
+        assert (np.abs(picture - common).max(1) <= 8).mean() < 0.8
+
+
+@pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.name)
+def test_one_orbits_as_far_as_the_photographs_reach(
+    page: Any, tmp_path: Path, world: World
+) -> None:
+    """All round an object; a facade or a wall from its front only."""
+    load_world(page, tmp_path, world)
+    drags = [{"kind": "drag", "values": [0, 0, 0.3, 0, 0, 0]}] * 24
+    states = page.evaluate("gestures => play(gestures)", drags)
+    towards = np.array([np.subtract(s["pose"][12:15], s["pivot"]) for s in states])
+    angles = np.unwrap(np.arctan2(towards[:, 0], towards[:, 2]))
+    turned = np.degrees(np.ptp(angles))
+    low, high = world.turn
+    assert low <= turned <= high
 
 
 def test_without_webgl_the_page_shows_a_message(page: Any, file: Path) -> None:
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(file.as_uri())
-    said = page.locator("#space p")
+    said = page.locator("#space .message")
     until(lambda: "this browser has no WebGL2" in said.inner_text())
     assert page.locator("#space-tools select").is_disabled()
+    assert page.locator("#space .poster").evaluate("poster => poster.naturalWidth") > 0
     assert page.locator("#pictures").is_visible()

@@ -64,9 +64,13 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 
 
 def rotation_angle(a: Gaussians, b: Gaussians) -> np.ndarray:
-    """(N,) degrees between the rotations; q and -q are the same rotation."""
+    """(N,) degrees between the ellipsoids' axes, which have no direction: quaternions that differ
+    in sign or by half a turn about one of the axes are equal."""
     p, q = (np.float64(g.arrays()["quats"]) for g in (a, b))
     p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
+    w, x, y, z = q.T
+    turned = [(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]
+    same = np.stack([sign * np.stack(values, 1) for values in turned for sign in (1, -1)])
     # The chord is exact for small angles, where the arc cosine is not.
-    chord = np.minimum(np.linalg.norm(p - q, axis=1), np.linalg.norm(p + q, axis=1))
+    chord = np.linalg.norm(p - same, axis=2).min(0)
     return np.degrees(4 * np.arcsin(np.clip(chord / 2, 0, 1)))

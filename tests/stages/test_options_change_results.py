@@ -61,6 +61,9 @@ FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_
 BLOCKS = under(poses="keep", partition__blocks=2, export__formats=["ply", "blocks"])
 DENSE = under(poses="keep", init__method="dense", export__formats=["dense_points", "dense_maps"])
 MESH = under(poses="keep", export__formats=["mesh"])
+VIDEO = under(
+    poses="keep", export__formats=["video"], export__video__seconds=1.0, export__video__fps=4
+)
 
 _T, _G, _M = "experiments.train", "experiments.train.gradient", "experiments.train.mcmc"
 
@@ -148,6 +151,10 @@ FLIPS = {
     "export.sh_degree": Flip(1, POSED),
     "export.min_opacity": Flip(0.25, POSED),
     "export.mesh_voxel": Flip(0.5, MESH),
+    "export.video.path": Flip("cameras", VIDEO),
+    "export.video.seconds": Flip(2.0, VIDEO),
+    "export.video.fps": Flip(5, VIDEO),
+    "export.video.long_side_px": Flip(48, VIDEO),
     "experiments.export.morton_order": Flip(False, POSED),
     "experiments.report.views": Flip(1, POSED),
 }

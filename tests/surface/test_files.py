@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import Mesh
 
@@ -84,12 +85,21 @@ def test_glb_holds_the_mesh_in_gltfs_units(tmp_path, mesh):
     assert abs(color[2, 0] / 65535 - 0.21586) < 1e-4
 
 
-@pytest.mark.parametrize("up", [(0, -1, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.0, -0.8)])
-def test_glb_stands_upright(tmp_path, mesh, up):
+@pytest.mark.parametrize(
+    ("up", "forward"),
+    [
+        ((0, -1, 0), (0, 0, 1)),
+        ((0, -0.999999, 0.001414), (0, 0, 1)),
+        ((0, 1, 0), (0, 0, 1)),
+        ((0, 0, 1), (0, 1, 0)),
+        ((0.6, 0.0, -0.8), (0.48, -0.8, 0.36)),
+    ],
+)
+def test_glb_stands_upright(tmp_path, mesh, up, forward):
+    """The heading is that of Gaussians in a .glb file: forward is +z, also if up is about -y."""
     write_mesh_glb(tmp_path / "mesh.glb", mesh, np.array(up, float))
     document, _ = read_glb((tmp_path / "mesh.glb").read_bytes())
     x, y, z, w = document["nodes"][0]["rotation"]
-    axis, v = np.array([x, y, z]), np.array(up, float)
-    turned = v + 2 * w * np.cross(axis, v) + 2 * np.cross(axis, np.cross(axis, v))
-    assert np.isclose(x * x + y * y + z * z + w * w, 1)
-    assert np.allclose(turned, (0, 1, 0), atol=1e-12)
+    rotation = quat_to_rotation(np.array([w, x, y, z]))
+    np.testing.assert_allclose(rotation @ up, (0, 1, 0), atol=2e-6)
+    np.testing.assert_allclose(rotation @ forward, (0, 0, 1), atol=2e-3)

@@ -11,16 +11,20 @@ import pytest
 import torch
 from PIL import Image
 
-import pipeline.surface.path as path_module
 import pipeline.surface.video as video
-from pipeline.config.schema import Split, Train
+from pipeline.config.schema import Export, Split, Train
+from pipeline.config.video import VideoExport
+from pipeline.io.videofile import read_video_facts
 from pipeline.metrics.protocol import choose_protocol
+from pipeline.render.views import render_rgb
+from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.outputs import write_rendered
 from tests.surface.scenes import view_at
 
 UP = np.array([0.0, 0.0, 1.0])
+needs_ffmpeg = pytest.mark.skipif(video.find_h264() is None, reason="no ffmpeg with H.264")
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +72,7 @@ def look(views):
 
 def test_depth_maps_and_renders_open_in_other_programs(tmp_path, ball, views):
     out = tmp_path / "out"
-    write_rendered(out, {"depths", "renders"}, ball, views, look(views), up=UP, mesh_voxel=None)
+    write_rendered(out, Export(formats=("depths", "renders")), ball, views, look(views), up=UP)
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     assert len(names) == 3 * len(views)
     assert {"depths/median/a/00.jpg.tiff", "depths/median/a/00.png.tiff"} <= names
@@ -100,7 +104,8 @@ def test_masks_alpha_and_test_views_in_depth_maps(tmp_path, ball, views):
 
 
 def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
-    messages = write_rendered(tmp_path, {"mesh"}, ball, views, look(views), up=UP, mesh_voxel=0.05)
+    config = Export(formats=("mesh",), mesh_voxel=0.05)
+    messages = write_rendered(tmp_path, config, ball, views, look(views), up=UP)
     assert "triangles from 11 views" in messages.decisions[0] and not messages.warnings
     data = (tmp_path / "mesh.ply").read_bytes()
     count = int(data.split(b"element vertex ")[1].split()[0])
@@ -116,33 +121,69 @@ def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
 def test_no_surface_gives_a_warning_and_no_mesh(tmp_path, ball, views):
     faint = replace(ball, opacity_logits=torch.full((len(ball),), -6.0))
     messages = write_rendered(
-        tmp_path / "out", {"mesh"}, faint, views, look(views), up=UP, mesh_voxel=None
+        tmp_path / "out", Export(formats=("mesh",)), faint, views, look(views), up=UP
     )
     assert messages.warnings and "no mesh" in messages.warnings[0]
     assert not (tmp_path / "out" / "mesh.ply").exists()
 
 
-def test_video_and_its_path(tmp_path, ball, views, monkeypatch):
-    monkeypatch.setattr(path_module, "FRAMES", 12)
+@pytest.fixture(scope="module")
+def blue_above(ball):
+    """The ball, blue where z > 0."""
+    colours = ball.sh.clone()
+    colours[ball.means[:, 2] > 0] *= -1
+    return replace(ball, sh=colours)
+
+
+@pytest.mark.parametrize(
+    "encoder", [video.VP9, pytest.param(video.H264, marks=needs_ffmpeg)], ids=["vp9", "h264"]
+)
+def test_a_video_shows_the_path_upright_in_order_at_the_size_and_rate_asked_for(
+    tmp_path, blue_above, views, monkeypatch, encoder
+):
+    if encoder == video.VP9:
+        monkeypatch.setattr(video, "find_h264", lambda: None)
+    config = Export(formats=("video",), video=VideoExport(seconds=1.5, fps=8, long_side_px=96))
     for out in ("one", "two"):
-        write_rendered(tmp_path / out, {"video"}, ball, views, look(views), up=UP, mesh_voxel=None)
+        messages = write_rendered(tmp_path / out, config, blue_above, views, look(views), up=UP)
+        assert encoder in messages.decisions[0]
     one, two = (tmp_path / out / "video.mp4" for out in ("one", "two"))
     assert one.read_bytes() == two.read_bytes()
+    assert sorted(p.name for p in one.parent.iterdir()) == ["path.json", "video.mp4"]
+    if encoder == video.H264:
+        tags = b"colrnclx" + bytes((0, 1, 0, 13, 0, 1))
+        assert tags in one.read_bytes(), "browsers show other colours"
+    facts = read_video_facts(one)
+    assert (facts.width, facts.height, facts.frames, facts.fps) == (96, 96, 12, 8)
     capture = cv2.VideoCapture(str(one))
     frames = []
     while (read := capture.read())[0]:
-        frames.append(read[1])
-    assert len(frames) == 12 and frames[0].shape == (40, 40, 3)
-    assert frames[3][20, 20, 2] > 180, "the ball is red, and in the middle"
-    messages = json.loads((tmp_path / "one" / "path.json").read_text())
-    assert len(messages["world_to_camera"]) == 12
-    assert sorted(p.name for p in one.parent.iterdir()) == ["path.json", "video.mp4"]
+        frames.append(read[1][..., ::-1].astype(float))
+    stored = json.loads((tmp_path / "one" / "path.json").read_text())
+    camera = replace(
+        views[0], width=96, height=96, **{n: stored[n] for n in ("fx", "fy", "cx", "cy")}
+    )
+    expected = [
+        255 * render_rgb(blue_above, replace(camera, world_to_camera=np.array(pose)), look(views))
+        for pose in stored["world_to_camera"]
+    ]
+    assert len(frames) == len(expected) == 12
+    for i, frame in enumerate(frames):
+        errors = [np.abs(frame - other).mean() for other in expected]
+        assert errors[i] == min(errors) < 6, "colours, or the order of the frames"
+        assert frame[33, 48, 2] > 180 > 80 > frame[33, 48, 0], "blue is above"
+        assert frame[62, 48, 0] > 180 > 80 > frame[62, 48, 2], "red is below"
 
 
-def test_without_encoders_the_video_is_an_animated_webp(tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "_ffmpeg", lambda *_: False)
-    monkeypatch.setattr(video, "_opencv", lambda *_: False)
-    frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 120, 240)]
-    written = video.write_video(tmp_path, frames, 30)
-    assert written.name == "video.webp"
-    assert Image.open(written).n_frames == 3
+@pytest.mark.parametrize("script", ["exit 0", "echo libx264 ' libx264 '; exit 3"])
+def test_ffmpeg_without_h264_is_not_used_and_its_failure_is_told(tmp_path, monkeypatch, script):
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    frames = (np.full((64, 64, 3), shade, np.uint8) for shade in range(30))
+    if script == "exit 0":
+        assert video.write_video(tmp_path / "video.mp4", frames, (64, 64), 30) == video.VP9
+    else:
+        with pytest.raises(UserError, match="ffmpeg to encode the video, found: 3"):
+            video.write_video(tmp_path / "video.mp4", frames, (64, 64), 30)

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipeline.surface.path import FRAMES, camera_path, describe_path
+from pipeline.config.video import VideoExport
+from pipeline.surface import path as path_module
+from pipeline.surface.path import describe_path
 from tests.surface.scenes import view_at
 
 UP = np.array([0.0, 0.0, 1.0])
+THREE_SECONDS = VideoExport(seconds=3)
+
+
+def camera_path(views, depth, up, video=THREE_SECONDS):
+    return path_module.camera_path(views, depth, up, video)[0]
 
 
 def ring(degrees, radius=3.0, height=1.0, count=24):
@@ -20,13 +29,15 @@ def centres(path):
     return np.stack([view.centre for view in path])
 
 
-def check_smooth(path):
-    """Closed, without a jump or a jerk in position or direction, upright."""
+def check_smooth(path, closed=True):
+    """Without a jump or a jerk in position or direction, upright."""
     at = centres(path)
     ahead = np.stack([view.world_to_camera[2, :3] for view in path])
-    length = np.linalg.norm(np.diff(at, axis=0, append=at[:1]), axis=1)
+    if closed:
+        at, ahead = (np.append(values, values[:1], axis=0) for values in (at, ahead))
+    length = np.linalg.norm(np.diff(at, axis=0), axis=1)
     assert length.max() < 6 * max(length.mean(), 1e-9)
-    assert (np.arccos(np.clip((ahead * np.roll(ahead, -1, 0)).sum(1), -1, 1))).max() < 0.3
+    assert (np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1, 1))).max() < 0.3
     for view in path:
         rotation = view.world_to_camera[:3, :3]
         assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
@@ -38,7 +49,7 @@ def test_around_a_full_ring():
     path = camera_path(ring(360), 3.0, UP)
     check_smooth(path)
     at = centres(path)
-    assert len(path) == FRAMES
+    assert len(path) == 90
     assert np.allclose(np.hypot(at[:, 0], at[:, 1]), 3, atol=0.05)
     assert np.allclose(at[:, 2], 1, atol=0.05)
     angle = np.unwrap(np.arctan2(at[:, 1], at[:, 0]))
@@ -73,15 +84,41 @@ def test_inside_a_room():
         for a in angles
     ]
     path = camera_path(views, 3.0, UP)
-    check_smooth(path)
+    check_smooth(path, closed=False)
     assert np.linalg.norm(centres(path)[:, :2], axis=1).max() < 0.35
+    ahead = np.stack([view.world_to_camera[2, :2] for view in path])
+    turned = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    assert turned[-1] - turned[0] > np.radians(300)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_views(count):
-    path = camera_path(ring(30, count=count), 3.0, UP)
-    check_smooth(path)
-    assert np.linalg.norm(centres(path) - centres(ring(30, count=count)).mean(0), axis=1).max() < 2
+def test_a_walk_has_constant_speed_without_the_shake_of_the_hand():
+    """Some photographs are close together, and each is 2 cm beside the way."""
+    rng = np.random.default_rng(0)
+    way = np.concatenate([np.linspace(0, 1, 30), np.linspace(1.2, 6, 25)])
+    aside = rng.normal(0, 0.02, (len(way), 2))
+    views = [view_at((x, y, 1 + z), (x, 9, 1)) for x, (y, z) in zip(way, aside, strict=True)]
+    path = camera_path(views, 5.0, UP, VideoExport(path="cameras", seconds=5))
+    check_smooth(path, closed=False)
+    at = centres(path)
+    assert np.allclose(at[[0, -1], 0], [0, 6], atol=0.3), "from the first to the last photograph"
+    step = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    assert step.max() < 1.2 * step.min()
+    assert np.abs(np.diff(at[:, 1:], 2, axis=0)).max() < 0.001, "the path is as shaky as the hand"
+
+
+def test_an_orbit_leaves_a_wide_gap_out():
+    at = centres(camera_path(ring(260), 3.0, UP))
+    angle = np.degrees(np.arctan2(at[:, 1], at[:, 0])) % 360
+    assert angle.max() < 260
+
+
+@pytest.mark.parametrize("kind", ["auto", "orbit", "cameras"])
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_views(count, kind):
+    views = ring(30, count=count)
+    path = camera_path(views, 3.0, UP, VideoExport(seconds=3, path=kind))
+    check_smooth(path, closed=kind != "cameras")
+    assert np.linalg.norm(centres(path) - centres(views).mean(0), axis=1).max() < 2
 
 
 def test_cameras_straight_above():
@@ -90,10 +127,17 @@ def test_cameras_straight_above():
         assert np.isfinite(view.world_to_camera).all()
 
 
-def test_frames_are_half_the_views_and_even():
-    path = camera_path(ring(360), 3.0, UP)
-    assert (path[0].width, path[0].height) == (48, 48)
-    assert np.isclose(path[0].fx / path[0].width, 110 / 96)
-    described = describe_path(path)
+@pytest.mark.parametrize(
+    ("size", "long_side", "expected"),
+    [((97, 64), None, (96, 64)), ((96, 63), 640, (640, 420)), ((31, 96), 48, (14, 48))],
+)
+def test_frames_have_even_sides_and_the_field_of_view_of_the_views(size, long_side, expected):
+    views = [replace(view, width=size[0], height=size[1]) for view in ring(360)]
+    video = VideoExport(seconds=2, fps=4, long_side_px=long_side)
+    path = camera_path(views, 3.0, UP, video)
+    assert (path[0].width, path[0].height) == expected
+    assert np.isclose(path[0].fx / path[0].width, 110 / size[0])
+    described = describe_path(path, video.fps)
+    assert len(described.world_to_camera) == 8
     assert np.array_equal(described.world_to_camera[7], path[7].world_to_camera)
-    assert described.width == 48
+    assert (described.width, described.height, described.fps) == (*expected, 4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class BlockCounters(BaseModel):
@@ -26,3 +27,6 @@ class PartitionCounters(StageCounters):
     largest_share: float = Field(
         ge=0, description="Pixels of the largest block's windows over the mean of all blocks."
     )
+
+    def headline(self) -> str:
+        return counted(len(self.blocks), "block")

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.runtime.text import counted
 
 
 class ChangeCounters(BaseModel):
@@ -71,3 +72,6 @@ class TrainCounters(StageCounters):
         description="Number of Gaussians removed because they were close to a single camera, "
         "or between neighbouring cameras.",
     )
+
+    def headline(self) -> str:
+        return f"{counted(self.num_gaussians, 'Gaussian')} after {counted(self.steps, 'step')}"

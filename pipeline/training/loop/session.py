@@ -70,8 +70,8 @@ class Session:
             self.saved = now
         if termination.requested():
             self._save(fetch)
-            self.log(f"terminated after {state.step} steps, which a checkpoint keeps")
-            raise termination.Terminated
+            self.log(f"stopped after {state.step} steps, which a checkpoint keeps")
+            termination.check()
         self.progress.advance(state.clock - before, note=self._note())
         self.metrics_log.write(state, last, factor, self.progress.seconds_left())
 

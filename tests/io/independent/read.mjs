@@ -1,9 +1,9 @@
-// node read.mjs FILE.spz: what Niantic's library decodes. node read.mjs validate|attributes FILE.glb:
+// node read.mjs spz FILE...: what Niantic's library decodes, in the axes of PLY files. node read.mjs validate|attributes FILE.glb:
 // what Khronos's validator says, or a primitive's attributes as glTF Transform reads them.
 import fs from 'node:fs';
 
-const task = process.argv.at(-2);
-const data = new Uint8Array(fs.readFileSync(process.argv.at(-1)));
+const [task, ...files] = process.argv.slice(2);
+const [data, ...more] = files.map(file => new Uint8Array(fs.readFileSync(file)));
 let result;
 if (task === 'attributes') {
     const { Logger, WebIO } = await import('@gltf-transform/core');
@@ -19,9 +19,12 @@ if (task === 'attributes') {
 } else {
     const { default: createModule } = await import('@adobe/spz');
     const spz = await createModule({ print: () => {} });
-    const cloud = spz.loadSpzFromBuffer(data, { to: spz.CoordinateSystem.UNSPECIFIED });
-    result = { antialiased: cloud.antialiased, shDegree: cloud.shDegree };
-    for (const name of ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'])
-        result[name] = Array.from(cloud[name]);
+    result = [data, ...more].map(bytes => {
+        const cloud = spz.loadSpzFromBuffer(bytes, { to: spz.CoordinateSystem.RDF });
+        const found = { antialiased: cloud.antialiased, shDegree: cloud.shDegree };
+        for (const name of ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'])
+            found[name] = Array.from(cloud[name]);
+        return found;
+    });
 }
 fs.writeSync(1, JSON.stringify(result));

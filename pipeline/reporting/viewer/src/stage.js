@@ -1,0 +1,176 @@
+// The scene in WebGL: Gaussians, sparse points, and the frame that the page shows them in.
+
+import * as THREE from "three";
+import { dyno, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+
+const FAR = 1e4;
+// Gaussians fade between these multiples of the scene's reach when the viewpoint leaves its hull.
+const FADE = [1.1, 1.6];
+
+export function bytes(base64) {
+  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64);
+  const text = atob(base64), out = new Uint8Array(text.length);
+  for (let i = 0; i < out.length; i++) out[i] = text.charCodeAt(i);
+  return out;
+}
+
+// Pose of a COLMAP camera in the page's frame, in three.js' convention: y up, looking along -z.
+export function poseInPage(worldToCamera, frame) {
+  const pose = new THREE.Matrix4().set(...worldToCamera, 0, 0, 0, 1).invert()
+    .multiply(new THREE.Matrix4().makeScale(1, -1, -1)).premultiply(frame);
+  const position = new THREE.Vector3(), quaternion = new THREE.Quaternion();
+  pose.decompose(position, quaternion, new THREE.Vector3());
+  return { position, quaternion };
+}
+
+export class Stage {
+  // `drawn` is called after each frame, `coverage` says what the cameras saw.
+  constructor(canvas, data, frame, coverage) {
+    Object.assign(this, { canvas, frame, coverage, requested: false, busy: false });
+    const renderer = this.renderer = new THREE.WebGLRenderer({ canvas });
+    renderer.setClearColor(new THREE.Color().setRGB(...data.background, THREE.SRGBColorSpace));
+    this.near = data.near * frame.getMaxScaleOnAxis();
+    this.camera = new THREE.PerspectiveCamera(50, 1, this.near, FAR);
+    // As splatmake's rasterizer: 3DGS's dilation, cutoff at alpha 1/255, sorted by depth.
+    this.spark = new SparkRenderer({
+      renderer,
+      onDirty: () => this.redraw(),
+      preBlurAmount: data.antialias ? 0 : 0.3,
+      blurAmount: data.antialias ? 0.3 : 0,
+      maxStdDev: Math.sqrt(2 * Math.log(255)),
+      minAlpha: 1 / 255,
+      maxPixelRadius: Infinity,
+      sortRadial: false,
+      accumExtSplats: true,
+      enableLod: false,
+    });
+    this.splats = new SplatMesh({
+      fileBytes: bytes(document.getElementById("splats").textContent),
+      extSplats: true,
+      minRaycastOpacity: 0.3,
+    });
+    frame.decompose(this.splats.position, this.splats.quaternion, this.splats.scale);
+    this.#fadeOutside();
+    this.points = sparsePoints(data);
+    this.points.visible = false;
+    this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
+  }
+
+  #fadeOutside() {
+    this.fade = new dyno.DynoFloat({ value: 0 });
+    const { reach, centre } = this.coverage;
+    const number = value => dyno.dynoConst("float", value);
+    this.splats.worldModifier = dyno.dynoBlock(
+      { gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+        const { center, opacity } = dyno.splitGsplat(gsplat).outputs;
+        const distance = dyno.length(dyno.sub(center, dyno.dynoConst("vec3", centre)));
+        const far = dyno.smoothstep(number(FADE[0] * reach), number(FADE[1] * reach), distance);
+        const share = dyno.sub(number(1), dyno.mul(this.fade, far));
+        return { gsplat: dyno.combineGsplat({ gsplat, opacity: dyno.mul(opacity, share) }) };
+      });
+  }
+
+  // Far Gaussians are a background that is right only from among the cameras.
+  setFade(value) {
+    if (value === this.fade.value) return;
+    this.fade.value = value;
+    this.splats.updateVersion();
+  }
+
+  redraw() {
+    if (this.requested || this.busy) return;
+    this.requested = true;
+    requestAnimationFrame(() => {
+      this.requested = false;
+      if (!this.busy) this.renderer.render(this.scene, this.camera);
+    });
+  }
+
+  resize(width, height, fov) {
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.fov = fov;
+    this.camera.updateProjectionMatrix();
+    this.redraw();
+  }
+
+  // The median distance of the surface along nine rays around a position on the canvas, in
+  // normalised device coordinates, `spread` apart; null if less than half of them hit the scene.
+  surface(x, y, spread) {
+    const rays = new THREE.Raycaster(), depths = [];
+    for (const i of [-1, 0, 1])
+      for (const j of [-1, 0, 1]) {
+        rays.setFromCamera(new THREE.Vector2(x + i * spread, y + j * spread), this.camera);
+        const [hit] = rays.intersectObject(this.splats);
+        if (hit && hit.point.distanceTo(this.coverage.centre) < 2 * this.coverage.reach)
+          depths.push(hit.distance);
+      }
+    if (depths.length < 5) return null;
+    depths.sort((a, b) => a - b);
+    rays.setFromCamera(new THREE.Vector2(x, y), this.camera);
+    return rays.ray.at(depths[depths.length >> 1], new THREE.Vector3());
+  }
+
+  // Wait until the splats are coloured and sorted for this camera.
+  async settled(camera = this.camera) {
+    const { spark, scene } = this;
+    const idle = async () => {
+      while (spark.sorting || spark.sortDirty) await new Promise(done => setTimeout(done, 5));
+    };
+    await idle();
+    await spark.update({ scene, camera });
+    await idle();
+  }
+
+  // Render the splats alone; returns the data URL of a PNG. The camera is a pinhole in world
+  // coordinates with the fields of data.cameras.
+  async picture({ width, height, fx, fy, cx, cy, world_to_camera }) {
+    const { near, renderer, scene } = this;
+    const camera = new THREE.PerspectiveCamera();
+    Object.assign(camera, { near, far: FAR });
+    const { position, quaternion } = poseInPage(world_to_camera, this.frame);
+    camera.position.copy(position);
+    camera.quaternion.copy(quaternion);
+    camera.updateMatrixWorld();
+    camera.projectionMatrix.set(
+      2 * fx / width, 0, 1 - 2 * cx / width, 0,
+      0, 2 * fy / height, 2 * cy / height - 1, 0,
+      0, 0, (near + FAR) / (near - FAR), 2 * near * FAR / (near - FAR),
+      0, 0, -1, 0);
+    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    const others = scene.children.filter(object => object !== this.spark && object !== this.splats);
+    const shown = others.map(object => object.visible), { visible } = this.splats;
+    this.busy = true;
+    try {
+      others.forEach(object => { object.visible = false; });
+      this.splats.visible = true;
+      renderer.setPixelRatio(1);
+      renderer.setSize(width, height, false);
+      this.setFade(0);
+      await this.settled(camera);
+      renderer.render(scene, camera);
+      return this.canvas.toDataURL("image/png");
+    } finally {
+      this.busy = false;
+      others.forEach((object, i) => { object.visible = shown[i]; });
+      this.splats.visible = visible;
+    }
+  }
+}
+
+function sparsePoints(data) {
+  const geometry = new THREE.BufferGeometry();
+  const xyz = new Int16Array(bytes(data.points).buffer);
+  geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(bytes(data.colours), 3, true));
+  const material = new THREE.PointsMaterial({ size: 0.02, vertexColors: true });
+  // The colours are sRGB already: no conversion.
+  material.onBeforeCompile = shader => {
+    shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
+  };
+  const points = new THREE.Points(geometry, material);
+  points.scale.setScalar(data.step);
+  points.frustumCulled = false;
+  return points;
+}

@@ -47,7 +47,7 @@ def check_passed_options(words: Sequence[str], own: Parser) -> None:
         value = value or ("VALUE" if after.startswith("-") or Path(after).exists() else after)
         theirs = [n for action in parser._actions for n in action.option_strings if n[:2] == "--"]
         error(f"unknown option {name}{did_you_mean(_meant(name, value, own.options(), theirs))}")
-    extra = [word for word in (*unknown, *found.targets) if not word.startswith("results/")]
+    extra = [*unknown, *found.targets]
     if extra:
         raise UserError(
             f"unexpected argument {extra[0]!r}",

@@ -29,6 +29,7 @@ REFUSED = {
     "rnu photos/door": "no command 'rnu' (did you mean run?)",
     "photos/door": "run photos/door?)",
     "run photos/door garden": "unexpected argument 'garden'",
+    "run photos/door results/door/plan.json -n": "unexpected argument 'results/door/plan.json'",
     "doctor now": "unexpected argument 'now'",
     "run": "missing FOLDER",
     "render a": "missing --cameras, -o/--out",

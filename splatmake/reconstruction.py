@@ -97,7 +97,7 @@ def reconstruct(
 
 
 def _run(command: list[str], folder: Path, shown: bool) -> tuple[int, str]:
-    """Run a command in ``folder`` ; return its exit code and the end of its output."""
+    """Run a command in ``folder``. Return its exit code and the end of its output."""
     kept: deque[str] = deque(maxlen=_KEPT_LINES)
     # Without PYTHONSAFEPATH, Python looks for packages in the current folder first, the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1", "NO_COLOR": "1"}

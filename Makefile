@@ -55,7 +55,14 @@ $(addprefix $(VENV)/,$(EXTRAS)): $(VENV)/%: requirements/%.txt $(VENV)/product
 	@$(PIP_INSTALL) -r requirements/$(@F).txt
 	@touch $@
 
-extension: $(VENV)/product
+# The command `splatmake` of this checkout. It finds the checkout from its own place, so that it runs
+# in any folder.
+$(BIN)/splatmake: | $(VENV)/product
+	@printf '%s\n' '#!/bin/sh' 'bin=$$(dirname "$$(readlink -f "$$0")")' \
+	  'PYTHONPATH=$$bin/../..$${PYTHONPATH:+:$$PYTHONPATH} exec "$$bin/python" -P -m pipeline "$$@"' > $@
+	@chmod +x $@
+
+extension: $(VENV)/product $(BIN)/splatmake
 	@$(BIN)/python -m pipeline.render.cpu.build
 	@$(BIN)/python -m pipeline.sfm.nearest
 	@$(BIN)/python -m pipeline.mvs.patchmatch

@@ -19,11 +19,13 @@ from typing import Any
 
 from pipeline.runtime import machine, native, processor, targets
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import COMMAND, IS_CHECKOUT, install_extra
 
 PYTHON = (3, 11)
 LOW_DISK = 10 << 30
 LOW_MEMORY = 4 << 30
 VULKAN_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_INSTALL = "make setup" if IS_CHECKOUT else "pip install splatmake"
 # The purpose of each distribution.
 NEEDED = {
     "torch": "training",
@@ -34,8 +36,8 @@ NEEDED = {
 }
 OPTIONAL = {
     "pillow-heif": "HEIC and HEIF photographs",
-    "viser": "python -m pipeline view",
-    "tensorboard": "python -m pipeline tensorboard",
+    "viser": f"{COMMAND} view",
+    "tensorboard": f"{COMMAND} tensorboard",
 }
 
 
@@ -144,7 +146,7 @@ def _libraries() -> list[Finding]:
         except UserError as error:
             found.append(Finding(topic, error.what, "missing", error.fix))
         except ImportError as error:
-            found.append(Finding(topic, f"cannot be loaded: {error}", "missing", "make setup"))
+            found.append(Finding(topic, f"cannot be loaded: {error}", "missing", _INSTALL))
     return found
 
 
@@ -162,7 +164,7 @@ def _describe(library: native.NativeLibrary) -> str:
     if built is not None:
         return f"built for {built.target} by {built.compiler}"
     native.compiler()
-    return "not built: compiled when first used, or by make setup"
+    return "not built: compiled when first used"
 
 
 def _rasterizer() -> Sequence[native.NativeLibrary]:
@@ -212,9 +214,7 @@ def _training_devices(has_graphics: bool) -> list[Finding]:
 
         chosen = choose_device()
         if find_spec("wgpu") is None:
-            fix = (
-                "pip install '.[gpu]' in the checkout, to train on a GPU" if has_graphics else None
-            )
+            fix = f"{install_extra('gpu')}, to train on a GPU" if has_graphics else None
             return [Finding("training", chosen.detail, "absent", fix)]
         found = adapters()
     except (ImportError, UserError) as error:
@@ -244,8 +244,7 @@ def _packages() -> list[Finding]:
     for name, purpose in NEEDED.items():
         version = _version(name)
         if version is None:
-            fix = "make setup, or pip install -r requirements/product.txt"
-            found.append(Finding(name, f"not installed: {purpose}", "missing", fix))
+            found.append(Finding(name, f"not installed: {purpose}", "missing", _INSTALL))
         else:
             found.append(Finding(name, version))
     for name, purpose in OPTIONAL.items():
@@ -261,13 +260,13 @@ def _lpips() -> Finding:
     topic = "LPIPS weights"
     if any(find_spec(name) is None for name in ("numpy", "torch")):
         return Finding(topic, "need torch", "absent")
-    from pipeline.metrics.lpips import weights_found
+    from pipeline.metrics.lpips import lpips_available, weights_found
 
     found = {net: len(weights_found(net)) for net in ("vgg", "alex")}
     whole = [net for net, files in found.items() if files == 2]
     if whole:
         return Finding(topic, ", ".join(whole))
-    fix = "pipeline/metrics/lpips.py names the two files and their folder"
+    fix = lpips_available("vgg")[1].removeprefix("weights not found: ")
     return Finding(topic, "not found: metrics.json has no LPIPS", "absent", fix)
 
 
@@ -284,7 +283,7 @@ def _disk(results: Path) -> Finding:
         place = place.parent
     free = shutil.disk_usage(place).free
     text = f"{free / 2**30:.1f} GiB free for {results}/ (in {place})"
-    fix = "large scenes need more: run in a folder on a larger disk (snakemake --directory)"
+    fix = "large scenes need more: run in a folder on a larger disk (--out)"
     return Finding("disk", text, fix=fix if free < LOW_DISK else None)
 
 

@@ -16,7 +16,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from pipeline.command.workflow import snakemake_command
+from pipeline.command.workflow import Running, run_command
 from pipeline.config.load import load_project
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.errors import UserError
@@ -35,6 +35,7 @@ def reconstruct(
     photographs: str | PathLike[str],
     out: str | PathLike[str] = ".",
     *,
+    name: str | None = None,
     preset: str | None = None,
     config: Mapping[str, Any] | None = None,
     cores: int | None = None,
@@ -47,8 +48,9 @@ def reconstruct(
     same arguments takes seconds, and one after an interruption continues.
 
     Args:
-        photographs: The folder of photographs of one scene. Its name is the scene's name.
+        photographs: The folder of photographs of one scene.
         out: The folder that holds ``results/``; made if it does not exist.
+        name: The scene's name in the results; None for that of the folder.
         preset: "fast", "balanced", "high" or "original"; None for that of ``config``, else
             "balanced".
         config: Options of the pipeline by section, such as ``{"train": {"steps": 2000}}``. Relative
@@ -74,23 +76,17 @@ def reconstruct(
             file = Path(temporary) / "config.json"
             file.write_text(json.dumps(dict(config), default=str))
             options = ["--configfile", str(file)]
-        command = snakemake_command(
-            scene=folder,
-            preset=preset,
-            cores="all" if cores is None else str(cores),
-            config=(),
-            profile=None,
-            options=options,
-        )
         try:
             work.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             what = f"expected a folder for the results: {error.strerror}"
             raise UserError(what, file=work, fix="give another folder as out") from None
+        count = "all" if cores is None else str(cores)
+        command = run_command(folder, name, Running(work, preset, count, (), None, options))
         code, output = _run(command, work, progress)
     if code != 0:
         raise _failure(folder, code, output)
-    results = work / "results" / folder.name
+    results = work / "results" / (name or folder.name)
     scene = load(results)
     warn(Metrics.read(results).warnings)
     return scene

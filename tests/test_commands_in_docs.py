@@ -15,6 +15,7 @@ import sys
 import pytest
 from snakemake.cli import get_argument_parser, parse_config
 
+from pipeline.command.config_entries import as_snakemake_reads
 from pipeline.command.main import WORKFLOW_COMMANDS, _parse
 from pipeline.config.load import load_project
 from tests.documented import CHECKED, NOT_CHECKED, PAGES, Command, commands
@@ -67,7 +68,8 @@ def check_splatmake(words: list[str]) -> None:
     options = _parse(words)
     if words[0] not in WORKFLOW_COMMANDS:
         return
-    others = ["--config", *options["config"]] if options["config"] else []
+    config = as_snakemake_reads(options["config"])
+    others = ["--config", *config] if config else []
     check_snakemake(["results/scene/metrics.json", *options["options"], *others])
 
 

@@ -1,53 +1,50 @@
-"""The command ``splatmake``: reconstruct a scene; convert, render, measure and view Gaussians of
-any program; compare batches; examine the machine."""
+"""The command ``splatmake``: reconstruct scenes; convert, render, measure and view Gaussians of any
+program; compare batches; examine the machine."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.presets import PRESETS
-from pipeline.render.registry import DEVICE
+from pipeline.command import parser as types
+from pipeline.command.parser import Parser
+from pipeline.command.workflow import add_workflow_commands
 from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.machine import usable_cores
+from pipeline.runtime.suggest import check_exists
 
 if TYPE_CHECKING:
     from pipeline.commands import Rendering
 
-MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
-EXAMPLES = """examples:
-  splatmake run photos/garden --preset fast --cores 4
-  splatmake plan photos/garden
-  splatmake view results/garden
-  splatmake convert point_cloud.ply scene.spz --min-opacity 0.02
-  splatmake render scene.spz --cameras data/garden/sparse/0 -o renders
-  splatmake evaluate point_cloud.ply --scene results/garden
-  splatmake compare results/benchmark.json --base balanced
-  splatmake doctor
-
-In a checkout, `python -m pipeline` is the same command, and
-`snakemake --cores all results/NAME/metrics.json` reconstructs data/NAME.
-"""
+MODEL = "file of Gaussians (.ply, .spz, .splat, .glb, or .npz of the results)"
 # The commands that pass further options to Snakemake.
-WORKFLOW_COMMANDS = ("run", "plan")
-# The largest whole number that an argument takes.
-_MAX_NUMBER = 1_000_000
+WORKFLOW_COMMANDS = ("run", "plan", "batch")
+# The arguments that are existing files or folders.
+_INPUTS = ("source", "model", "cameras", "scene", "folders")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return the exit code: 2 after a ``UserError``."""
-    options = _parse(sys.argv[1:] if arguments is None else arguments)
-    run: Callable[..., int | None] = options.pop("command")
     try:
+        options = _parse(sys.argv[1:] if arguments is None else arguments)
+        run: Callable[..., int | None] = options.pop("command")
+        for name in _INPUTS:
+            for path in _as_list(options.get(name)):
+                check_exists(path)
         return run(**options) or 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+    except BrokenPipeError:  # What read the output has ended, as `head` does.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (UserError, OSError) as error:
         known = error if isinstance(error, UserError) else as_user_error(error)
         if known is None:
@@ -56,73 +53,99 @@ def main(arguments: list[str] | None = None) -> int:
         return EXIT_USER_ERROR
 
 
+def _as_list(value: Any) -> list[Path]:
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
 def _parse(arguments: list[str]) -> dict[str, Any]:
-    parser = make_parser()
-    if arguments[:1] and arguments[0] in WORKFLOW_COMMANDS:
-        # The "--" before Snakemake's options is optional.
-        mark = arguments.index("--") if "--" in arguments else len(arguments)
-        known, others = parser.parse_known_args(arguments[:mark] + arguments[mark + 1 :])
-        return vars(known) | {"options": others}
-    return vars(parser.parse_args(arguments))
+    """The arguments of a command, with the function that runs it as ``command``.
+
+    Raises:
+        UserError: An argument is wrong or missing.
+    """
+    parser = make_parser(COMMAND)
+    name = next(iter(arguments), "--help")
+    # The "--" before Snakemake's options is optional.
+    mark = arguments.index("--") if name in WORKFLOW_COMMANDS and "--" in arguments else None
+    words = arguments if mark is None else arguments[:mark] + arguments[mark + 1 :]
+    known, others = parser.parse_known_args(words or [name])
+    options = vars(known)
+    if name in WORKFLOW_COMMANDS:
+        return options | {"options": others}
+    if others:
+        options["parser"].unknown(others)
+    del options["parser"]
+    return options
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """The parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="splatmake",
-        description="Reconstruct a scene from photographs; convert, render, measure and view "
+def make_parser(program: str = "splatmake") -> Parser:
+    """The parser of the command line.
+
+    Args:
+        program: The name of the program in usages and examples.
+    """
+    parser = Parser(
+        prog=program,
+        description="Reconstruct scenes from photographs; convert, render, measure and view "
         "Gaussians of any program; compare batches; examine the machine.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=f"example:\n  {program} run photos/garden --preset fast\n"
+        f"  {program} view results/garden\n\n{program} COMMAND --help describes a command.",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    parser.add_argument("--version", action="version", version=f"splatmake {_version()}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     def command(
-        name: str, run: Callable[..., int | None], text: str, about: str | None = None, **more: Any
+        name: str,
+        run: Callable[..., int | None],
+        text: str,
+        example: str,
+        about: str | None = None,
     ) -> Callable[..., object]:
         """Add a command, and return the ``add_argument`` of its parser."""
-        sub = commands.add_parser(name, help=text, description=about, **more)
-        sub.set_defaults(command=run)
+        about = about or f"{text[0].upper()}{text[1:]}."
+        epilog = f"example:\n  {program} {name} {example}".rstrip()
+        sub = commands.add_parser(name, help=text, description=about, epilog=epilog)
+        sub.set_defaults(command=run, parser=sub)
         return sub.add_argument
 
-    for name, run, text in (
-        ("run", _run, "reconstruct a scene from a folder of photographs"),
-        ("plan", _plan, "show the stages that run would execute, with reasons, and the jobs"),
-    ):
-        about = (
-            f"{text[0].upper()}{text[1:]}. Results are in results/ of the current folder, and "
-            "config/config.yaml there is read if it exists. All other options are Snakemake's; "
-            "they follow the folder."
-        )
-        _add_workflow(command(name, run, text, about, allow_abbrev=False))
-    text = "convert Gaussians to another format, optionally with fewer coefficients"
-    _add_convert(command("convert", _convert, text))
-    _add_render(command("render", _render, "render Gaussians from given cameras, to PNG"))
-    text = "PSNR and SSIM of each view against its photograph"
-    about = f"Evaluate a model on the scene's test views: {text}, and their means."
-    _add_evaluate(command("evaluate", _evaluate, text, about))
-    text = "show a scene in the browser, also during training (needs viser)"
+    add_workflow_commands(command)
+    text = "show a scene in the browser, also during training"
     about = (
-        "Show a scene in the browser, rendered by the rasterizer of the training. During training, "
-        "the newest checkpoint is shown and updated twice a minute."
+        "Show a scene in the browser. During training, the newest checkpoint is shown and "
+        "updated twice a minute."
     )
-    _add_view(command("view", _view, text, about))
-    text = "tables of a batch (results/benchmark.json), or of two"
+    _add_view(command("view", _view, text, "results/garden", about))
+    text = "convert Gaussians to another format, optionally with fewer coefficients"
+    example = "point_cloud.ply garden.spz --min-opacity 0.02"
+    _add_convert(command("convert", _convert, text, example))
+    example = "garden.spz --cameras results/garden -o renders"
+    _add_render(command("render", _render, "render Gaussians from given cameras, to PNG", example))
+    text = "PSNR and SSIM of Gaussians against a scene's photographs"
+    about = "PSNR and SSIM of each test view against its photograph, and their means."
+    example = "point_cloud.ply --scene results/garden"
+    _add_evaluate(command("evaluate", _evaluate, text, example, about))
+    text = "tables of a batch, or of two"
     about = (
         "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
         "differences between two batches of the same runs."
     )
-    _add_compare(command("compare", _compare, text, about))
-    text = "write training curves for TensorBoard (needs tensorboard)"
-    _add_tensorboard(command("tensorboard", _tensorboard, text))
+    _add_compare(command("compare", _compare, text, "results --base fast", about))
+    text = "write training curves for TensorBoard"
+    _add_tensorboard(command("tensorboard", _tensorboard, text, "results -o curves --follow"))
+    text = "list the options of --config and explain them"
+    about = (
+        "Explain options, or without a name list all with their defaults, as a configuration file."
+    )
+    add = command("options", _options, text, "train.steps", about)
+    text = "option or section, such as train.steps or train"
+    add("names", nargs="*", metavar="NAME", help=text)
     text = "show what this machine has, what is used, and what is missing"
     about = (
-        "Report processor, instruction set, compilers, memory, graphics cards, packages and disk "
-        "(+ used, - optional and absent, ! required and missing), and what to do. The exit code is "
-        "2 if something required is missing."
+        "Report processor, compilers, memory, graphics cards, packages and disk (+ used, - "
+        "optional and absent, ! required and missing), and what to do. The exit code is 2 if "
+        "something required is missing."
     )
-    _add_doctor(command("doctor", _doctor, text, about))
+    _add_doctor(command("doctor", _doctor, text, "", about))
     return parser
 
 
@@ -130,42 +153,12 @@ def make_parser() -> argparse.ArgumentParser:
 # what they need, so that --help and wrong options do not import torch.
 
 
-def _add_workflow(add: Callable[..., object]) -> None:
-    add("scene", type=Path, metavar="FOLDER", help="the scene's photographs")
-    add("--preset", choices=tuple(PRESETS), help="(default: the configuration file's)")
-    add("-c", "--cores", default="all", metavar="N", help="processor cores to use (default: all)")
-    add(
-        *("-C", "--config"),
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help="options of the pipeline, such as 'train={steps: 2000}'",
-    )
-    add(
-        "--workflow-profile",
-        dest="profile",
-        metavar="PROFILE",
-        help="Snakemake profile: a folder, or one of the program's: ci, slurm",
-    )
-
-
-def _run(**options: Any) -> None:
-    from pipeline.command.workflow import replace_process, snakemake_command
-
-    replace_process(snakemake_command(**options))
-
-
-def _plan(options: list[str], **others: Any) -> None:
-    _run(options=["--dry-run", *options], **others)
-
-
 def _add_convert(add: Callable[..., object]) -> None:
     add("source", type=Path, metavar="MODEL", help=MODEL)
     add("target", type=Path, metavar="OUT", help="file to write, by its suffix")
     add("--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)")
     text = "remove Gaussians with a lower opacity, 0 to 1 (default 0)"
-    add("--min-opacity", type=_share, default=0.0, metavar="SHARE", help=text)
+    add("--min-opacity", type=types.share, default=0.0, metavar="SHARE", help=text)
     text = "sort along a Z-order curve: smaller files"
     add("--morton-order", action="store_true", help=text)
 
@@ -209,7 +202,7 @@ def _add_evaluate(add: Callable[..., object]) -> None:
         "every N-th view, sorted by name, is a test view; 0: evaluate all views (default: as the "
         "scene was trained, else 8)"
     )
-    add("--every", type=_every, metavar="N", help=text)
+    add("--every", type=types.every, metavar="N", help=text)
     _add_rendering(add, "the scene's", "as the scene was trained")
 
 
@@ -237,8 +230,8 @@ def _add_rendering(add: Callable[..., object], background: str, antialias: str) 
     text = f"Mip-Splatting's opacity compensation (default: {antialias})"
     add("--antialias", action=argparse.BooleanOptionalAction, help=text)
     _add_device(add)
-    add("--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this")
-    add("--threads", type=_positive, default=usable_cores(), help="(default: all cores)")
+    add("--max-side", type=types.positive, metavar="PIXELS", help="reduce larger views to this")
+    add("--threads", type=types.positive, default=usable_cores(), help="(default: all cores)")
 
 
 def _rendering(options: dict[str, Any]) -> Rendering:
@@ -252,7 +245,7 @@ def _rendering(options: dict[str, Any]) -> Rendering:
 
 
 def _add_device(add: Callable[..., object]) -> None:
-    add("--device", type=_device, default="cpu", help="cpu, gpu or gpu:N (default: cpu)")
+    add("--device", type=types.device, default="cpu", help="cpu, gpu or gpu:N (default: cpu)")
 
 
 def _add_view(add: Callable[..., object]) -> None:
@@ -271,12 +264,12 @@ def _add_view(add: Callable[..., object]) -> None:
         help="answer requests that name this host or come from its pages, as behind a proxy; can "
         "be repeated (default: only localhost, this machine's name and addresses in numbers)",
     )
-    add("--port", type=_positive, default=8080, help="(default: %(default)s)")
-    text = "longer side (default: 800)"
-    add("--side", type=_positive, default=800, metavar="PIXELS", help=text)
+    add("--port", type=types.positive, default=8080, help="(default: %(default)s)")
+    text = "longer side (default: %(default)s)"
+    add("--side", type=types.positive, default=800, metavar="PIXELS", help=text)
     _add_device(add)
     text = "(default: 1, leaving the others to training)"
-    add("--threads", type=_positive, default=1, help=text)
+    add("--threads", type=types.positive, default=1, help=text)
 
 
 def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> None:
@@ -289,8 +282,9 @@ def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> Non
 
 
 def _add_compare(add: Callable[..., object]) -> None:
-    add("batches", type=Path, nargs="+", metavar="BENCHMARK_JSON", help="one or two")
-    text = "configuration that others are compared with (default: the default preset)"
+    text = "results folder of a batch, or its benchmark.json; one or two (default: results)"
+    add("batches", type=Path, nargs="*", default=[Path("results")], metavar="BATCH", help=text)
+    text = "configuration that others are compared with (default: the first)"
     add("--base", metavar="CONFIG", help=text)
     text = "list each run of one batch, without comparison"
     add("--each", action="store_true", help=text)
@@ -300,6 +294,12 @@ def _compare(**options: Any) -> None:
     from pipeline.reporting.compare import compare
 
     _print(compare(**options))
+
+
+def _options(names: list[str]) -> None:
+    from pipeline.command.options import describe
+
+    _print(describe(names))
 
 
 def _add_tensorboard(add: Callable[..., object]) -> None:
@@ -344,38 +344,6 @@ def _version() -> str:
         return metadata.version("splatmake")
     except metadata.PackageNotFoundError:
         return "(a checkout)"
-
-
-def _device(text: str) -> str:
-    if not DEVICE.fullmatch(text):
-        raise argparse.ArgumentTypeError(f"expected cpu, gpu or gpu:N, found {text!r}")
-    return text
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"expected a number from 0 to 1, found {text!r}")
-    return value
-
-
-def _positive(text: str) -> int:
-    return _whole_number(text, (0,), "a positive whole number")
-
-
-def _every(text: str) -> int:
-    return _whole_number(text, (1,), "0, 2 or more")
-
-
-def _whole_number(text: str, refused: tuple[int, ...], expected: str) -> int:
-    number = int(text) if text.isdecimal() and len(text) <= 10 else -1
-    if not 0 <= number <= _MAX_NUMBER or number in refused:
-        expected += f", at most {_MAX_NUMBER}" if number > _MAX_NUMBER else ""
-        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:40]!r}")
-    return number
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.suggest import did_you_mean, nearest_path
 
 _MAX_BYTES = 1 << 20
 # Aliases can make a short file stand for any number of values.
@@ -30,7 +31,8 @@ def check_config_file(path: Path) -> None:
         content = yaml.safe_load(path.read_bytes().decode("utf-8-sig"))
         count = _count(content, {})
     except OSError as error:
-        raise _wrong(path, f"cannot be read: {error.strerror}") from None
+        meant = did_you_mean(None if path.exists() else nearest_path(path))
+        raise _wrong(path, f"cannot be read: {error.strerror}{meant}") from None
     except UnicodeDecodeError as error:
         raise _wrong(path, f"expected text in UTF-8, found other bytes at {error.start}") from None
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from itertools import islice
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic_core import ErrorDetails
 
+from pipeline.config.names import hint
 from pipeline.config.options import sections_of
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import is_config_name
 from pipeline.config.schema import Config
 from pipeline.config.section import FilePath, Seed
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import COMMAND
+from pipeline.runtime.suggest import did_you_mean, nearest
 from pipeline.runtime.text import shortened, shown
 
+_SECTION = "Input should be a mapping of options to values, as in {steps: 2000}"
 # The quotation marks around a text that ``shown`` quotes.
 _QUOTES = "'\""
 # Further pairs of a scene and a configuration are checked when their run is planned.
@@ -33,9 +39,11 @@ def _named_configs(value: Any) -> Any:
     if isinstance(value, list | tuple):
         unknown = [name for name in value if not isinstance(name, str) or name not in PRESETS]
         if unknown:
+            name = shown(unknown[0]).strip(_QUOTES)
+            meant = did_you_mean(nearest(name, PRESETS))
             raise ValueError(
-                f"{shown(unknown[0]).strip(_QUOTES)} is no preset ({', '.join(PRESETS)}); "
-                "configurations of your own are a mapping from a name to its options"
+                f"{name} is no preset{meant}, as {', '.join(PRESETS)} are; configurations "
+                "of your own are a mapping from a name to its options"
             )
         return {name: {"preset": name} for name in value}
     for name in value if isinstance(value, Mapping) else ():
@@ -132,7 +140,7 @@ def _validated(model: type[Any], raw: Mapping[str, Any], prefix: str) -> Any:
         lines = _error_lines(model, error, prefix)
         raise UserError(
             "the configuration is not valid:\n  " + "\n  ".join(lines),
-            fix=f"see {' and '.join(REFERENCE)} for every option",
+            fix=f"{COMMAND} options lists all options, {COMMAND} options NAME explains one",
         ) from None
 
 
@@ -142,12 +150,14 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
     wrong: dict[str, tuple[list[str], str]] = {}
     lines: list[str] = []
     for problem in problems[:_MAX_ERRORS]:
-        path, sections = _path(model, problem["loc"])
+        path = _path(model, problem["loc"])
         if problem["type"] == "extra_forbidden":
-            lines.append(f"{path}: no such option{_nearest(sections, path)}")
+            meant = hint(model, path, problem["input"], str(problem["loc"][-1]))
+            lines.append(f"{path}: no such option{meant}")
             continue
-        expected, _ = wrong.setdefault(path, ([], shown(problem["input"])))
-        expected.append(shortened(problem["msg"].removeprefix("Value error, "), _MAX_MESSAGE))
+        expected, _ = wrong.setdefault(path, ([], _found(problem)))
+        message = _SECTION if problem["type"] == "model_type" else problem["msg"]
+        expected.append(shortened(message.removeprefix("Value error, "), _MAX_MESSAGE))
     for path, (expected, found) in wrong.items():
         first, *others = dict.fromkeys(expected)
         alternatives = [text.removeprefix("Input should be ") for text in others]
@@ -158,8 +168,18 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
     return lines
 
 
-def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> tuple[str, tuple[type[BaseModel], ...]]:
-    """The dotted path of an error's location, and the sections that its last part belongs to.
+def _found(problem: ErrorDetails) -> str:
+    """The value of an option that is wrong, and what is probably wrong with it."""
+    value = problem["input"]
+    if isinstance(value, str) and problem["type"] == "literal_error":
+        names = re.findall(r"'(.+?)'", problem["ctx"]["expected"])
+        return f"{shown(value)}{did_you_mean(nearest(value, names))}"
+    unclosed = isinstance(value, str) and value[:1] == "{" and problem["type"] == "model_type"
+    return f"{shown(value)}{' (a brace is missing)' if unclosed else ''}"
+
+
+def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+    """The dotted path of an error's location.
 
     pydantic adds the strategy's name to locations in ``train.density``, and the kind of a value to
     those of an option that allows several kinds; a path has none of them.
@@ -180,13 +200,4 @@ def _path(model: type[BaseModel], loc: tuple[Any, ...]) -> tuple[str, tuple[type
             inner = sections_of(fields[0])
             leaf = not inner
             sections, alternatives = inner, len(inner) > 1
-    return ".".join(names), sections
-
-
-def _nearest(sections: tuple[type[BaseModel], ...], path: str) -> str:
-    """A hint at the option that was probably meant."""
-    from difflib import get_close_matches
-
-    names = [name for section in sections for name in section.model_fields]
-    close = get_close_matches(path.rsplit(".", 1)[-1], names, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
+    return ".".join(names)

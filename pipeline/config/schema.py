@@ -261,8 +261,9 @@ class Train(Section):
     device: Device = Field(
         "auto",
         description="What trains: cpu, the processor; gpu, a GPU through WebGPU, or another than "
-        "the first (gpu:1); it needs `pip install '.[gpu]'` in the checkout. auto: a GPU if a "
-        "short measurement on this machine finds that it is faster, but not on a cluster.",
+        "the first (gpu:1); it needs `pip install 'splatmake[gpu]'` (in a checkout: '.[gpu]'). "
+        "auto: a GPU if a short measurement on this machine finds that it is faster, but not on a "
+        "cluster.",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the spherical harmonics.")
     background: Literal["auto", "skybox", "black", "white", "random"] = Field(

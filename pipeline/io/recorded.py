@@ -48,7 +48,7 @@ def read_recorded(path: str | Path, digest: str | None) -> bytes:
     raise ChangedFileError(
         "has changed since the scene was inspected",
         file=path,
-        fix="run the same snakemake command again: the stages that use this file are run again; "
+        fix="run the same command again: the stages that use this file are run again; "
         "leave the scene's files unchanged while snakemake runs",
     )
 

@@ -66,8 +66,8 @@ class ProtocolDescription(JsonObject):
     poses: str | None = Field(description="Adjustment of test cameras; null without.")
     published: PublishedProtocol | None = Field(
         None,
-        description="null for scenes of no published benchmark, and for models that `python -m "
-        "pipeline evaluate` measures.",
+        description="null for scenes of no published benchmark, and for models that `splatmake "
+        "evaluate` measures.",
     )
 
 

@@ -365,8 +365,7 @@ def _write_frames(
         raise ChangedFileError(
             "has changed since the scene was inspected",
             file=Path(video.path),
-            fix="run the same snakemake command again, and leave the scene's files unchanged while "
-            "it runs",
+            fix="run the same command again, and leave the scene's files unchanged while it runs",
         )
     return photos
 

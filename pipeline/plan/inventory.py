@@ -21,6 +21,7 @@ from pipeline.io.names import (
 from pipeline.io.posefiles import GivenPoses, other_pose_files
 from pipeline.io.poses.kinds import POSE_LABELS
 from pipeline.io.walk import TooManyFilesError, walk
+from pipeline.runtime.layout import guide
 from pipeline.runtime.text import is_plain
 
 # These files are not for reconstruction (docs/guides/inputs.md): texts, side-cars and databases of
@@ -42,7 +43,6 @@ _POSES = re.compile(
     r"\.(json|xml|csv|txt|out|npy|bak|old)(\.bak|\.old|~)?",
     re.IGNORECASE,
 )
-_GUIDES = "docs/guides"
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,12 @@ _KINDS: Mapping[str, _Kind] = {
     "masks": _Kind(
         "masks",
         "no photograph has this name, or another mask is used for it; masks belong into masks/, "
-        f"named as the photographs ({_GUIDES}/masks.md)",
+        f"named as the photographs{guide('masks')}",
     ),
     "depths": _Kind(
         "depth maps",
         "no photograph has this name, or another depth map is used for it; depth maps belong into "
-        f"depths/, named as the photographs ({_GUIDES}/depth-maps.md)",
+        f"depths/, named as the photographs{guide('depth-maps')}",
     ),
     "models": _Kind(
         "files of COLMAP models",
@@ -98,19 +98,18 @@ _KINDS: Mapping[str, _Kind] = {
     "poses": _Kind(
         "pose files",
         "no pose file has this name (such as transforms.json or cameras.xml), or {poses} comes "
-        f"first ({_GUIDES}/given-poses.md)",
+        f"first{guide('given-poses')}",
     ),
     "positions": _Kind(
         "files of positions",
-        "positions are read from EXIF and gcp_list.txt; write them there "
-        f"({_GUIDES}/georeference.md)",
+        f"positions are read from EXIF and gcp_list.txt; write them there{guide('georeference')}",
     ),
     "clouds": _Kind(
         "point clouds",
         "the point cloud is points.ply (or another format) or the folder points/, or name it with "
         "init.points_file",
     ),
-    "other": _Kind("files", f"no input has this name and format ({_GUIDES}/inputs.md)"),
+    "other": _Kind("files", f"no input has this name and format{guide('inputs')}"),
 }
 
 

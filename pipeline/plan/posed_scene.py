@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from pipeline.plan.record import read_plan
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.json_file import first_error, mismatch
+from pipeline.runtime.layout import rerun_command
 from pipeline.runtime.record import STAGE, read_stage
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
@@ -153,11 +153,10 @@ def _in_unit(
 
 
 def _unfinished(folder: Path, missing: str) -> UserError:
-    target = shlex.quote(str(folder / "metrics.json"))
     return UserError(
         f"expected a finished scene, found no {missing}: its run has not finished",
         file=folder,
-        fix=f"finish it: snakemake --cores all {target}, with the options of that run",
+        fix=f"finish it: {rerun_command(folder)}, with the options of that run",
     )
 
 

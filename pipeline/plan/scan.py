@@ -40,6 +40,7 @@ from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
 from pipeline.runtime.errors import ChangedFileError, UserError
+from pipeline.runtime.suggest import did_you_mean, nearest, nearest_path
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
 
 
@@ -119,9 +120,9 @@ class Scan(BaseModel):
         """
         if self.fingerprint != fingerprint:
             raise ChangedFileError(
-                "the scene has changed since snakemake was started",
+                "the scene has changed since this command was started",
                 file=folder,
-                fix="run the same snakemake command again, and leave the scene's files unchanged "
+                fix="run the same command again, and leave the scene's files unchanged "
                 "while it runs",
             )
 
@@ -403,13 +404,14 @@ def _check_folder(folder: Path) -> None:
     root = folder.parent
     if not root.is_dir():
         raise UserError(
-            "this folder of scenes does not exist",
+            f"this folder of scenes does not exist{did_you_mean(nearest_path(root, folders=True))}",
             file=root,
             fix="set data_root to the folder that holds the scene folders",
         )
     scenes = sorted(path.name for path in root.iterdir() if path.is_dir() and path.name[0] != ".")
+    missing = f"no such scene folder{did_you_mean(nearest(folder.name, scenes))}"
     raise UserError(
-        "no such scene folder" if not folder.exists() else "expected a scene folder, found a file",
+        missing if not folder.exists() else "expected a scene folder, found a file",
         file=folder,
         fix=f"choose one of the scenes in {root}: {', '.join(scenes) or 'none'}",
     )

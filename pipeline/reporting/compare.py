@@ -1,8 +1,8 @@
 """Tables of the runs of a batch, of differences between its configurations, or between two batches.
 
-    splatmake compare results/benchmark.json --each
-    splatmake compare results/benchmark.json --base balanced
-    splatmake compare first/benchmark.json results/benchmark.json
+    splatmake compare results --each
+    splatmake compare results --base balanced
+    splatmake compare first/results results
 
 prints the table as Markdown. ``config/ablations.yaml`` and ``config/skipping.yaml`` define batches
 for such comparisons.
@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.runs import Run
-from pipeline.config.schema import Config
 from pipeline.io.bounded import MIB, read_bounded
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import COMMAND
+from pipeline.runtime.suggest import check_exists, did_you_mean, nearest
 
 # Identical, to the bit, for repeated runs on the same machine.
 QUALITY = (
@@ -40,7 +41,7 @@ POSES = (
 WORK = (*POSES, "train")
 # A batch of 200,000 runs.
 _MAX_BYTES = 256 * MIB
-_FIX = "create one: snakemake results/benchmark.csv"
+_FIX = f"create one: {COMMAND} batch FOLDER"
 
 Row = dict[str, Any]
 
@@ -190,8 +191,8 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
     """A table of one batch, or of the differences between two, as lines of Markdown.
 
     Args:
-        batches: One or two ``benchmark.json``.
-        base: The configuration that others are compared with; None: the default preset.
+        batches: One or two ``benchmark.json``, or folders that hold them.
+        base: The configuration that others are compared with; None: the first.
         each: List the runs of one batch, without comparison.
 
     Raises:
@@ -208,11 +209,12 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
         return repeated(*runs)
     if each:
         return each_run(runs[0])
-    base = base or Config().preset
-    configs = sorted({row["config"] for row in runs[0]})
+    configs = list(dict.fromkeys(row["config"] for row in runs[0]))
+    base = configs[0] if base is None else base
     if base not in configs:
+        meant = did_you_mean(nearest(base, configs))
         raise UserError(
-            f"expected a configuration {base!r}, found {', '.join(configs)}",
+            f"expected a configuration {base!r}, found {', '.join(configs)}{meant}",
             file=batches[0],
             fix="name one of them with --base",
         )
@@ -220,8 +222,13 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
 
 
 def _read(path: Path) -> list[Row]:
+    check_exists(path, _FIX)
+    path = path / "benchmark.json" if path.is_dir() else path
     try:
-        return list(json.loads(read_bounded(path, _MAX_BYTES, fix=_FIX))["runs"])
+        runs = list(json.loads(read_bounded(path, _MAX_BYTES, fix=_FIX))["runs"])
+        if not runs:
+            raise ValueError("it has no runs")
+        return runs
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(
             f"expected a benchmark.json: {error}",

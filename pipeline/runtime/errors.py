@@ -11,6 +11,8 @@ EXIT_USER_ERROR = 2
 # The largest numbers of characters of a line, and of the parts of a message.
 _MAX_LINE = 600
 _MAX_WHAT, _MAX_FILE, _MAX_FIX = 1150, 280, 450
+ELSEWHERE = "--out of splatmake run, --directory of snakemake"
+"""How a run in another folder is started."""
 EXIT_INTERRUPTED = 130
 """By convention 128 and the number of the signal, SIGINT."""
 
@@ -69,9 +71,9 @@ class ChangedFileError(UserError):
 def as_user_error(error: OSError) -> UserError | None:
     """The ``UserError`` for a full disk or missing permissions; None for other errors."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"
+        fix = f"free some space, or run in a folder on a larger disk ({ELSEWHERE})"
         return UserError("the disk is full", file=error.filename, fix=fix)
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        fix = "make it writable, or run in another folder (snakemake --directory)"
+        fix = f"make it writable, or run in another folder ({ELSEWHERE})"
         return UserError("permission denied", file=error.filename, fix=fix)
     return None

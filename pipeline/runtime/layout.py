@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from pathlib import Path
 
@@ -10,6 +11,9 @@ PACKAGES = Path(__file__).resolve().parents[2]
 """The folder that holds the packages: the repository's, or site-packages."""
 
 IS_CHECKOUT = (PACKAGES / "Snakefile").is_file()
+
+COMMAND = "python -m pipeline" if IS_CHECKOUT else "splatmake"
+"""The command line of the program, for messages."""
 
 WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 """The folder of the Snakefile and of ``profiles/``; setup.py copies them there."""
@@ -19,6 +23,29 @@ SCAN_CACHE = ".scratch/scan.json"
 
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
 """Native libraries in wheels."""
+
+
+def install_extra(name: str) -> str:
+    """The command that installs the packages of an extra (``watch``, ``gpu``, ``slurm``)."""
+    if IS_CHECKOUT:
+        return f"pip install '.[{name}]' in the checkout"
+    return f"pip install 'splatmake[{name}]'"
+
+
+def rerun_command(results: Path) -> str:
+    """The command that makes the results of a scene.
+
+    Args:
+        results: The folder ``results/NAME``.
+    """
+    if IS_CHECKOUT:
+        return f"snakemake --cores all {shlex.quote(str(results / 'metrics.json'))}"
+    return "splatmake run FOLDER"
+
+
+def guide(name: str) -> str:
+    """The guide that explains a message, in brackets; empty in an installation, which has none."""
+    return f" (docs/guides/{name}.md)" if IS_CHECKOUT else ""
 
 
 def user_cache() -> Path:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shlex
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import rerun_command
 
 STAGE, HIDDEN_STAGE, RUN = "stage.json", ".stage.json", "run.json"
 RECORDS = (STAGE, HIDDEN_STAGE, RUN)
@@ -263,9 +263,8 @@ def changed(folder: Path) -> str:
 
 def rerun(folder: Path) -> str:
     """The advice to rerun the stage with this folder, which may be that of one of its jobs."""
-    target = shlex.quote(str(folder.parent / "metrics.json"))
     stage = re.sub(r"_[0-9]+$", "", folder.name)
     return (
-        f"add --forcerun {stage} to the end of the snakemake command that you use, as in: "
-        f"snakemake --cores all {target} --forcerun {stage}"
+        f"add --forcerun {stage} to the end of the command that you use, as in: "
+        f"{rerun_command(folder.parent)} --forcerun {stage}"
     )

@@ -15,6 +15,7 @@ from pipeline.geometry.up_direction import up_direction
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import install_extra
 from pipeline.scene.views import View
 from pipeline.watching.access import checked
 from pipeline.watching.source import Source
@@ -221,6 +222,6 @@ def _viser() -> Any:
     except ImportError as error:
         raise UserError(
             f"viser, which serves the page, is not installed ({error})",
-            fix="pip install viser==1.1.1",
+            fix=install_extra("watch"),
         ) from None
     return viser

@@ -50,6 +50,7 @@ class Source:
             raise UserError(
                 "a file of Gaussians contains no cameras", file=path, fix="give --cameras"
             )
+        self._file()  # Its absence is the error of a folder that has neither.
         exported = path.is_file() and is_exported(path)
         self.views = camera_views(read_cameras(cameras or path, exported=exported), None)
         self.near = near_plane(scene_extent(self.views))
@@ -88,7 +89,8 @@ class Source:
             raise UserError(
                 "expected a trained scene or a checkpoint of a training, found neither",
                 file=self.path,
-                fix="start the training; the first checkpoint is written after half a minute",
+                fix="name the results of a scene, as results/NAME; a training writes its first "
+                "checkpoint after half a minute",
             )
         return max(found, key=lambda file: file.stat().st_mtime_ns)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import install_extra
 from pipeline.training.loop.metrics_log import NAME, MetricsRecord, read_metrics_log
 
 SCALARS = {
@@ -88,6 +89,6 @@ def _writer() -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise UserError(
-            f"TensorBoard is not installed ({error})", fix="pip install tensorboard==2.21.0"
+            f"TensorBoard is not installed ({error})", fix=install_extra("watch")
         ) from None
     return SummaryWriter

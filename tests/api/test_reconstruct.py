@@ -20,15 +20,15 @@ import splatmake
 from splatmake import UserError, reconstruction
 
 
-def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> dict[str, Any]:
+def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> list[Any]:
     """Let this Python code be the pipeline; returns the arguments that it is called with."""
-    called: dict[str, Any] = {}
+    called: list[Any] = []
 
-    def command(**arguments: Any) -> list[str]:
-        called.update(arguments)
+    def command(*arguments: Any) -> list[str]:
+        called.extend(arguments)
         return [sys.executable, "-c", code]
 
-    monkeypatch.setattr(reconstruction, "snakemake_command", command)
+    monkeypatch.setattr(reconstruction, "run_command", command)
     return called
 
 
@@ -68,7 +68,8 @@ def test_output_is_shown_on_request(
         splatmake.reconstruct("photos", tmp_path / "new", cores=3, progress=progress)
     out, err = capfd.readouterr()
     assert out == "" and err == (f"training {tmp_path / 'new'}\n" if progress else "")
-    assert called["cores"] == "3" and called["scene"] == Path("photos").absolute()
+    folder, name, how = called
+    assert (folder, name, how.cores) == (Path("photos").absolute(), None, "3")
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,7 @@ def test_an_interruption_ends_the_pipeline_and_its_jobs(
     """Only this process gets the signal, as in a notebook."""
     code = (
         "import sys, splatmake\nfrom splatmake import reconstruction\n"
-        f"reconstruction.snakemake_command = lambda **_: [sys.executable, '-c', {RUN!r}]\n"
+        f"reconstruction.run_command = lambda *_: [sys.executable, '-c', {RUN!r}]\n"
         "splatmake.reconstruct('.', '.')\n"
     )
     user = subprocess.Popen(

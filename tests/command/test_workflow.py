@@ -10,6 +10,7 @@ from snakemake.cli import parse_config
 
 from pipeline.command import workflow
 from pipeline.command.main import main
+from pipeline.config.load import load_project
 
 
 @pytest.fixture
@@ -56,29 +57,54 @@ def test_options_are_ours_or_snakemakes(
 
 
 def test_profiles_of_the_program_have_names(
-    tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    started: list[list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     main(["run", str(tmp_path), "--workflow-profile", "slurm"])
     command = started.pop()
     chosen = Path(command[command.index("--workflow-profile") + 1])
     assert "slurm" in (chosen / "config.yaml").read_text()
+    with monkeypatch.context() as without:
+        without.setattr(workflow, "_SLURM", "no_such_plugin")
+        assert main(["run", str(tmp_path), "--workflow-profile", "slurm"]) == 2
+    assert "pip install '.[slurm]'" in capsys.readouterr().err
     (tmp_path / "slurm").mkdir()
     main(["run", str(tmp_path), "--workflow-profile", "slurm"])
-    assert "slurm" in started.pop()  # the user's own
+    assert str(tmp_path / "slurm") in started.pop()  # the user's own
 
 
-def test_no_folder_is_a_clear_error(
-    tmp_path: Path, started: list[list[str]], capsys: pytest.CaptureFixture[str]
+def test_dotted_names_are_options_of_sections(tmp_path: Path, started: list[list[str]]) -> None:
+    given = ["train.steps=5", "train.density.strategy=mcmc", "train={sh_degree: 1}", "seed=3"]
+    assert main(["run", str(tmp_path), "--config", *given]) == 0
+    found = config_of(started.pop())
+    assert found["train"] == {"steps": "5", "density": {"strategy": "mcmc"}, "sh_degree": "1"}
+    assert load_project(found)[0].train.steps == 5 and found["seed"] == 3
+
+
+def test_a_named_scene_is_a_link_beside_the_results(
+    tmp_path: Path, started: list[list[str]]
 ) -> None:
-    assert main(["run", str(tmp_path / "gardn")]) == 2
-    assert "expected a folder of photographs, found nothing" in capsys.readouterr().err
-    assert not started
+    """A folder whose name Snakemake cannot take, with results in a folder that does not exist."""
+    photos, out = tmp_path / "IMG 2024 {1}", tmp_path / "out"
+    photos.mkdir()
+    for _ in range(2):
+        assert main(["run", str(photos), "--name", "garden", "--out", str(out)]) == 0
+        command = started.pop()
+        assert "results/garden/metrics.json" in command
+        assert command[command.index("--directory") + 1] == str(out)
+        root = Path(config_of(command)["data_root"])
+        assert (root / "garden").samefile(photos) and root.is_relative_to(out)
 
 
-def test_a_mistyped_option_of_another_command_is_refused(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit):
-        main(["doctor", "--jsn"])
-    assert "--jsn" in capsys.readouterr().err
+def test_a_batch_is_all_scenes_of_a_folder(tmp_path: Path, started: list[list[str]]) -> None:
+    (tmp_path / "door").mkdir()
+    words = ["--configs", "fast,balanced", "--seeds", "0, 1", "--keep-going"]
+    assert main(["batch", str(tmp_path), *words]) == 0
+    command = started.pop()
+    project, _ = load_project(config_of(command))
+    assert project.data_root == str(tmp_path) and project.seeds == [0, 1]
+    assert list(project.configs) == ["fast", "balanced"]
+    assert "all" in command and "--keep-going" in command

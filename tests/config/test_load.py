@@ -17,12 +17,17 @@ from pipeline.runtime.errors import UserError
     ("raw", "named"),
     [
         ({"trian": {"steps": 1}}, "trian: no such option (did you mean train?)"),
-        ({"train": {"stps": 1}}, "train.stps: no such option (did you mean steps?)"),
+        (
+            {"steps": 100},
+            "steps: no such option (did you mean train.steps, as in --config 'train={steps: 100}'",
+        ),
+        ({"train.sh_degre": 1}, "(did you mean train.sh_degree, as in"),
+        ({"train": {"stps": 1}}, "train.stps: no such option (did you mean train.steps?)"),
         ({"train": {"steps": 0}}, "train.steps"),
         ({"train": {"mask_loss_weight": float("nan")}}, "train.mask_loss_weight"),
         (
             {"train": {"density": {"max_gausians": 5}}},
-            "train.density.max_gausians: no such option (did you mean max_gaussians?)",
+            "max_gausians: no such option (did you mean train.density.max_gaussians?)",
         ),
         ({"train": {"density": {"strategy": "none"}}}, "train.density: "),
         (
@@ -31,10 +36,13 @@ from pipeline.runtime.errors import UserError
         ),
         (
             {"experiments": {"train": {"gradient": {"interval_": 1}}}},
-            "experiments.train.gradient.interval_: no such option (did you mean interval?)",
+            "interval_: no such option (did you mean experiments.train.gradient.interval?)",
         ),
         ({"scenes": {"fox": {"exprt": {}}}}, "scenes.fox: exprt"),
         ({"preset": "quick"}, "preset"),
+        ({"preset": "fastt"}, "found 'fastt' (did you mean fast?)"),
+        ({"train": "{steps: 5"}, "{steps: 2000}, found '{steps: 5' (a brace is missing)"),
+        ({"configs": ["fsat"]}, "fsat is no preset (did you mean fast?), as fast, balanced"),
         ({"matches": {"pairs": "all"}}, "matches.pairs"),
         ({"configs": ["quick"]}, "quick is no preset"),
         ({"configs": {"a@b": {}}}, "'a@b' cannot name a configuration"),

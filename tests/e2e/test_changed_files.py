@@ -46,7 +46,7 @@ def test_a_photograph_replaced_while_snakemake_runs(project):
     done = snakemake(project, FEATURES.format("tiny"), config=TINY, check=False)
     assert done.returncode != 0 and "Traceback" not in done.stdout
     assert f"{first.name}: has changed since the scene was inspected" in done.stdout
-    assert "run the same snakemake command again" in done.stdout
+    assert "run the same command again" in done.stdout
 
     snakemake(project, FEATURES.format("tiny"), config=TINY)
     shutil.copytree(project / "data" / "tiny", project / "data" / "fresh")

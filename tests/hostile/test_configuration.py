@@ -39,7 +39,7 @@ REFUSED: dict[str, tuple[dict[Any, Any], str]] = {
     ),
     "seed-true": ({"seed": True}, "seed: .* not true or false"),
     "seeds": ({"seeds": [True]}, "seeds.0: .* not true or false"),
-    "bomb": ({"train": DEEP}, "train: Input should be a valid dictionary"),
+    "bomb": ({"train": DEEP}, "train: Input should be a mapping"),
     "bomb-in-number": ({"train": {"steps": DEEP}}, "train.steps: Input should be a valid integer"),
     "long-value": ({"preset": "x" * 10_000_000}, "found 'xxx"),
     "long-name": ({"x" * 10_000_000: 1}, "xxx: no such option"),

@@ -107,7 +107,7 @@ def test_the_remedy_for_a_wrong_digest_in_the_cache_holds(tmp_path, capfd):
         read_recorded(wrong.photos[0].path, wrong.photos[0].digest)
 
     assert run_stage(request(tmp_path), work) == EXIT_USER_ERROR
-    assert "run the same snakemake command again" in capfd.readouterr().err
+    assert "run the same command again" in capfd.readouterr().err
     assert look(tmp_path / "s", cache).fingerprint == right
 
 

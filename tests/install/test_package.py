@@ -228,3 +228,17 @@ def test_a_wheel_with_kernels_needs_no_compiler(
     assert used["versions"]["splatmake"] == "0.1.0" and used["commit"] is None
     cache = reconstruction.cache
     assert not cache.exists() or not list(cache.rglob("*.so"))
+
+
+def test_a_checkouts_command_runs_in_any_folder(tmp_path):
+    """Also in one whose files have the names of packages."""
+    sources = copy_sources(tmp_path / "sources")
+    make_environment(sources / ".venv")
+    (sources / ".venv" / "product").touch()
+    subprocess.run(["make", "--silent", ".venv/bin/splatmake"], cwd=sources, check=True)
+    work = tmp_path / "work"
+    for name in ("pipeline", "random"):
+        (work / name).mkdir(parents=True)
+        (work / f"{name}.py").write_text("raise SystemExit(9)\n")
+    shown = run(sources / ".venv", "splatmake", "options", "train.steps", cwd=work).stdout
+    assert shown.startswith("train.steps: whole number")

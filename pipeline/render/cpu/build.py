@@ -64,7 +64,7 @@ def source_hash() -> str:
 def _torch_root() -> Path:
     spec = importlib.util.find_spec("torch")
     if spec is None or spec.origin is None:
-        raise UserError("torch is not installed", fix="pip install -e . in this environment")
+        raise UserError("torch is not installed", fix="install splatmake with its dependencies")
     return Path(spec.origin).parent
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.render.gpu.kernels import source
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.layout import install_extra
 
 THREADS = 256  # kThreads in common.wgsl
 SMALLEST = 256  # The bytes of a buffer: bindings must not be smaller than their struct.
@@ -34,7 +35,7 @@ SMALLER = (
     "lower train.density.max_gaussians or views.max_long_side_px, set partition.blocks, or set "
     "train.device: cpu"
 )
-NO_WGPU = "install it with pip install '.[gpu]' in the checkout, or set train.device: cpu"
+NO_WGPU = f"{install_extra('gpu')}, or set train.device: cpu"
 NO_GPU = (
     "install the GPU's driver with Vulkan (vulkaninfo lists devices), or set train.device: "
     "cpu; splatmake doctor shows what is found"

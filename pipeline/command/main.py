@@ -100,12 +100,11 @@ def make_parser(program: str = "splatmake") -> Parser:
         text: str,
         example: str,
         about: str | None = None,
-        **more: Any,
     ) -> Callable[..., object]:
         """Add a command, and return the ``add_argument`` of its parser."""
         about = about or f"{text[0].upper()}{text[1:]}."
         epilog = f"example:\n  {program} {name} {example}".rstrip()
-        sub = commands.add_parser(name, help=text, description=about, epilog=epilog, **more)
+        sub = commands.add_parser(name, help=text, description=about, epilog=epilog)
         sub.set_defaults(command=run, parser=sub)
         return sub.add_argument
 

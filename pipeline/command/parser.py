@@ -34,7 +34,8 @@ class Parser(argparse.ArgumentParser):
     """An ``ArgumentParser`` whose errors are raised as ``UserError``."""
 
     def __init__(self, **options: Any):
-        super().__init__(formatter_class=_Formatter, **options)
+        # Abbreviations could be options of Snakemake.
+        super().__init__(formatter_class=_Formatter, allow_abbrev=False, **options)
 
     def format_help(self) -> str:
         self.usage = self.short_usage().replace("%", "%%")

@@ -17,9 +17,10 @@ from pipeline.config.config_file import check_config_file
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import name_fault
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.layout import COMMAND, PACKAGES, WORKFLOW
+from pipeline.runtime.layout import COMMAND, PACKAGES, WORKFLOW, install_extra
 from pipeline.runtime.suggest import did_you_mean, nearest, nearest_path
 
+_SLURM = "snakemake_executor_plugin_slurm"
 NAMED_SCENES = ".splatmake"
 """The folder beside ``results/`` with a symbolic link for each scene that ``--name`` has named."""
 
@@ -223,6 +224,8 @@ def _profile(name: str) -> str:
     if name == "none" or Path(name).exists():  # "none" is Snakemake's word.
         return name if name == "none" else os.path.abspath(name)
     if (ours / name).is_dir():
+        if name == "slurm" and importlib.util.find_spec(_SLURM) is None:
+            raise UserError("Snakemake's plugin for Slurm is missing", fix=install_extra("slurm"))
         return str(ours / name)
     names = sorted(path.name for path in ours.iterdir())
     meant = did_you_mean(nearest(name, names) or nearest_path(Path(name)))

@@ -57,13 +57,20 @@ def test_options_are_ours_or_snakemakes(
 
 
 def test_profiles_of_the_program_have_names(
-    tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    started: list[list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     main(["run", str(tmp_path), "--workflow-profile", "slurm"])
     command = started.pop()
     chosen = Path(command[command.index("--workflow-profile") + 1])
     assert "slurm" in (chosen / "config.yaml").read_text()
+    with monkeypatch.context() as without:
+        without.setattr(workflow, "_SLURM", "no_such_plugin")
+        assert main(["run", str(tmp_path), "--workflow-profile", "slurm"]) == 2
+    assert "pip install '.[slurm]'" in capsys.readouterr().err
     (tmp_path / "slurm").mkdir()
     main(["run", str(tmp_path), "--workflow-profile", "slurm"])
     assert str(tmp_path / "slurm") in started.pop()  # the user's own

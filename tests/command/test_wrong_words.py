@@ -22,6 +22,7 @@ REFUSED = {
     "run photos/door --cores nine": "expected a number of cores or all, found 'nine'",
     "run photos/door --preset fastt": "found 'fastt' (did you mean fast?)",
     "run photos/door --workflow-profile slrum": "no profile 'slrum' (did you mean slurm?)",
+    "run photos/door --prese fast": "unknown option --prese (did you mean --preset?)",
     "doctor --jsn": "unknown option --jsn (did you mean --json?)",
     "convert a b --min-opacity 2": "expected a number from 0 to 1, found '2'",
     # commands and arguments

@@ -13,7 +13,7 @@ MEANT = {
     "results/door": "results/door/metrics.json",
     "results/door/metric.json": "results/door/metrics.json",
     "results/door/metricsjson": "results/door/metrics.json",
-    "results/door/reprot.html": "results/door/report.html",
+    "results/door/repotr.html": "results/door/report.html",
     "results/door/trian/stage.json": "results/door/train/stage.json",
     "results/dor/metrics.json": "results/door/metrics.json",
     "results/dor@fast@seed1/metrics.json": "results/door@fast@seed1/metrics.json",
@@ -25,7 +25,7 @@ MEANT = {
     "al": "all",
     "results/benchmark.cvs": "results/benchmark.csv",
     "benchmark.csv": "results/benchmark.csv",
-    "results/indx.html": "results/index.html",
+    "results/index.htm": "results/index.html",
 }
 
 

@@ -115,7 +115,7 @@ def make_parser(program: str = "splatmake") -> Parser:
         "updated twice a minute."
     )
     _add_view(command("view", _view, text, "results/garden", about))
-    text = "convert Gaussians to another format, optionally with fewer coefficients"
+    text = "convert Gaussians to another file format"
     example = "point_cloud.ply garden.spz --min-opacity 0.02"
     _add_convert(command("convert", _convert, text, example))
     example = "garden.spz --cameras results/garden -o renders"

@@ -45,7 +45,7 @@ class Parser(argparse.ArgumentParser):
         """The arguments that must be given."""
         needed = [action for action in self._actions if action.required]
         needed = sorted(needed, key=lambda action: bool(action.option_strings))
-        words = [word for a in needed for word in (*a.option_strings[-1:], str(a.metavar))]
+        words = [word for a in needed for word in (*a.option_strings[-1:], _value_name(a))]
         return " ".join([self.prog, *words, "[OPTIONS]"])
 
     def error(self, message: str) -> NoReturn:
@@ -73,6 +73,10 @@ class Parser(argparse.ArgumentParser):
         if not name.startswith("-"):
             self.error(f"unexpected argument {name!r}")
         self.error(f"unknown option {name}{did_you_mean(nearest(name, self.options()))}")
+
+
+def _value_name(action: argparse.Action) -> str:
+    return str(action.metavar or "|".join(action.choices or [action.dest.upper()]))
 
 
 def device(text: str) -> str:

@@ -112,7 +112,7 @@ class Running:
 
     def submitted(self) -> list[str]:
         """The ids of its Slurm jobs."""
-        return re.findall(r"SLURM jobid (\d+)", self.text())
+        return re.findall(r"Slurm job (\d+)", self.text())
 
     def next_job(self, count: int) -> str:
         """The id of the job that is submitted after ``count`` others."""

@@ -282,7 +282,7 @@ def abandoned(
     cluster.stop_controller()
     # Without an answer, Snakemake's executor tries accounting, and again at the next check.
     query = "Falling back to 'sacct'"
-    until(lambda: run.text().count(query) >= 2, "a second status query without the controller")
+    until(lambda: run.log().count(query) >= 2, "a second status query without the controller")
     cluster.start_controller()
     until(lambda: jobs.field(old, "JobState") == "RUNNING", "the job after the controller's start")
     restarted += [tuple(jobs.field(old, name) for name in ("JobId", "JobState", "Restarts"))]

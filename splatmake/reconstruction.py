@@ -35,6 +35,7 @@ def reconstruct(
     photographs: str | PathLike[str],
     out: str | PathLike[str] = ".",
     *,
+    name: str | None = None,
     preset: str | None = None,
     config: Mapping[str, Any] | None = None,
     cores: int | None = None,
@@ -47,8 +48,9 @@ def reconstruct(
     same arguments takes seconds, and one after an interruption continues.
 
     Args:
-        photographs: The folder of photographs of one scene. Its name is the scene's name.
+        photographs: The folder of photographs of one scene.
         out: The folder that holds ``results/``; made if it does not exist.
+        name: The scene's name in the results; None for that of the folder.
         preset: "fast", "balanced", "high" or "original"; None for that of ``config``, else
             "balanced".
         config: Options of the pipeline by section, such as ``{"train": {"steps": 2000}}``. Relative
@@ -74,31 +76,24 @@ def reconstruct(
             file = Path(temporary) / "config.json"
             file.write_text(json.dumps(dict(config), default=str))
             options = ["--configfile", str(file)]
-        how = Running(
-            out=None,
-            preset=preset,
-            cores="all" if cores is None else str(cores),
-            config=(),
-            profile=None,
-            options=options,
-        )
-        command = run_command(folder, None, how)
         try:
             work.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             what = f"expected a folder for the results: {error.strerror}"
             raise UserError(what, file=work, fix="give another folder as out") from None
+        count = "all" if cores is None else str(cores)
+        command = run_command(folder, name, Running(work, preset, count, (), None, options))
         code, output = _run(command, work, progress)
     if code != 0:
         raise _failure(folder, code, output)
-    results = work / "results" / folder.name
+    results = work / "results" / (name or folder.name)
     scene = load(results)
     warn(Metrics.read(results).warnings)
     return scene
 
 
 def _run(command: list[str], folder: Path, shown: bool) -> tuple[int, str]:
-    """Run a command in ``folder`` ; return its exit code and the end of its output."""
+    """Run a command in ``folder``. Return its exit code and the end of its output."""
     kept: deque[str] = deque(maxlen=_KEPT_LINES)
     # Without PYTHONSAFEPATH, Python looks for packages in the current folder first, the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1", "NO_COLOR": "1"}

@@ -64,7 +64,7 @@ def work(job: Job) -> None:
         shown=job.section(Experiments).report.views,
     )
     write_report(data, job.out / "report.html")
-    job.decide(f"{job.scene}: {headline(metrics)}")
+    job.decide(headline(metrics))
 
 
 SPEC = StageSpec(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -106,18 +106,6 @@ class CoverageSection:
     pictures: Mapping[str, NDArray[np.uint8]]
 
 
-class Download(NamedTuple):
-    """A file that the page offers.
-
-    Attributes:
-        path: Relative to the page, between slashes.
-        size: In bytes.
-    """
-
-    path: str
-    size: int
-
-
 class TrainingRecord(NamedTuple):
     """A record of the training curve, and the seconds of training at its end."""
 
@@ -138,8 +126,6 @@ class SceneResults:
         decisions: The decisions of each stage, the plan's and those of ``stage.json``.
         curve: The training curve.
         comparisons: The views to show, worst first.
-        downloads: The exported files beside the page.
-        own_names: The photograph's name of each view that a stage has renamed.
         blocks: The trained blocks; None for a scene that was trained as one block.
     """
 
@@ -151,8 +137,6 @@ class SceneResults:
     decisions: Mapping[str, Sequence[str]]
     curve: Sequence[TrainingRecord]
     comparisons: Sequence[Comparison]
-    downloads: Sequence[Download] = ()
-    own_names: Mapping[str, str] = field(default_factory=dict)
     blocks: BlocksSection | None = None
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from pipeline.reporting.text import count, duration, fixed, megabytes, plain
+from pipeline.reporting.text import count, duration, fixed, plain
 
 _TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).with_name("templates")),
@@ -18,7 +18,6 @@ _TEMPLATES = Environment(
     undefined=StrictUndefined,
 )
 _TEMPLATES.filters |= {"fixed": fixed, "count": count, "duration": duration, "plain": plain}
-_TEMPLATES.filters["megabytes"] = megabytes
 _TEMPLATES.filters["px"] = lambda value: f"{value:.1f}"
 
 

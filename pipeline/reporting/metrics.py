@@ -58,7 +58,6 @@ class TimedStage(StageStatus):
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    earlier_s: float = 0.0
     peak_rss_mb: float = 0.0
 
 
@@ -109,7 +108,6 @@ def with_times(metrics: Metrics, runs: Mapping[str, RunRecord]) -> TimedMetrics:
         shown["stages"][name] |= {
             "wall_s": round(run.wall_s + run.earlier_s, 3),
             "cpu_s": run.cpu_s,
-            "earlier_s": run.earlier_s,
             "peak_rss_mb": run.peak_rss_mb,
         }
     return TimedMetrics.model_validate(shown)

@@ -15,18 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.plan.record import PlanRecord
 from pipeline.reporting.blocks import blocks_map
 from pipeline.reporting.charts import histogram, line_chart
 from pipeline.reporting.coverage import coverage_content
-from pipeline.reporting.dag import plan_svg
 from pipeline.reporting.data import SceneResults, TrainingRecord
 from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
-from pipeline.reporting.names import with_own_names
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
 from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
-from pipeline.reporting.verdict import judge
 from pipeline.runtime.atomic import write_text
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.scene.reconstruction import Points
@@ -52,8 +48,6 @@ def write_report(results: SceneResults, path: Path) -> None:
 
 def report_html(results: SceneResults) -> str:
     """The page as a string."""
-    records = {"metrics.json": results.metrics, "plan.json": results.plan}
-    results = with_own_names(results)
     metrics = results.metrics
     masked = any(v.mask is not None and not v.mask.all() for v in results.comparisons)
     pictures = {
@@ -66,22 +60,22 @@ def report_html(results: SceneResults) -> str:
         "charts": _point_charts(results.points),
         "georeference": _georeference(metrics.georeference) if metrics.georeference else None,
     }
+    records = {"metrics.json": metrics, "plan.json": results.plan}
     raw = {
         name: json.dumps(record.model_dump(mode="json"), indent=2, ensure_ascii=False)
         for name, record in records.items()
     }
     contents: list[tuple[str, str, Any]] = [
         ("pictures", "Photograph and render", pictures),
-        ("coverage", "What to photograph next", coverage_content(results)),
-        ("quality", "Quality", None),
-        ("views", "All views", _measures(metrics)),
-        ("reconstruction", "Reconstruction", reconstruction),
+        ("coverage", "Coverage by the photographs", coverage_content(results)),
         ("training", "Training", _curve_charts(results.curve)),
-        ("stages", "Stages", _plan_of_running(results.plan)),
+        ("reconstruction", "Reconstruction", reconstruction),
+        ("views", "All views", _measures(metrics)),
+        ("stages", "Stages", None),
         ("how", "Decisions and protocol", raw),
     ]
     if results.blocks is not None:
-        contents.insert(-2, ("blocks", "Blocks", blocks_map(results, results.blocks.partition)))
+        contents.insert(2, ("blocks", "Blocks", blocks_map(results, results.blocks.partition)))
     sections = [
         Section(key, title, f"scene/{key}.html.jinja", content) for key, title, content in contents
     ]
@@ -92,23 +86,13 @@ def report_html(results: SceneResults) -> str:
             "scene/page.html.jinja",
             results=results,
             metrics=metrics,
-            verdict=judge(metrics, results.coverage.record),
-            scene=first,
-            sections=sections,
-            first_of_engineers="quality",
+            sections=[first, *sections],
             viewer=viewer_script(),
         )
 
     # The Gaussians get what the rest of the page leaves.
     rest = page(ViewerContent("", Markup(), "", viewer_poster(results)))
     return page(viewer_content(results, _MAX_BYTES - len(rest)))
-
-
-def _plan_of_running(plan: PlanRecord) -> Markup:
-    """The diagram of the stages that ran."""
-    order = [name for name in plan.order if plan.runs(name)]
-    stages = {name: plan.stages[name] for name in order}
-    return plan_svg(plan.model_copy(update={"order": order, "stages": stages}))
 
 
 def _curve_charts(curve: Sequence[TrainingRecord]) -> dict[str, list[Markup]]:

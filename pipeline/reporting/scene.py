@@ -17,7 +17,6 @@ from pipeline.reporting.data import (
     BlocksSection,
     Comparison,
     CoverageSection,
-    Download,
     Rank,
     SceneResults,
     TrainedScene,
@@ -25,12 +24,10 @@ from pipeline.reporting.data import (
     ranked,
 )
 from pipeline.reporting.metrics import TimedMetrics, together
-from pipeline.reporting.names import own_names
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.json_file import mismatch
-from pipeline.runtime.record import RECORDS, read_run, read_stage
+from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.blocks import Partition
-from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Points
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.curve import TrainingCurve
@@ -47,7 +44,7 @@ def read_results(
     """Read the results of a scene.
 
     Args:
-        folders: The folders of inspect, train, evaluate, coverage and export, by stage.
+        folders: The folders of inspect, train, evaluate and coverage, by stage.
         metrics: The content of ``metrics.json`` with the times of the stages.
         plan: The plan of the scene.
         trained: The Gaussians and their views.
@@ -70,20 +67,8 @@ def read_results(
             _comparison(label, measured, trained, folders["evaluate"] / "renders")
             for label, measured in ranked(metrics.per_view, shown)
         ],
-        downloads=_downloads(folders["export"]),
-        own_names=own_names(
-            [view.name for view in trained.views],
-            [photo.name for photo in Manifest.read(folders["inspect"] / "images.json").photos],
-        ),
         blocks=_blocks(plan, scene),
     )
-
-
-def _downloads(folder: Path) -> list[Download]:
-    """The exported files, largest first."""
-    files = [file for file in folder.glob("[!.]*.*") if file.is_file() and file.name not in RECORDS]
-    found = [Download(f"{folder.name}/{file.name}", file.stat().st_size) for file in files]
-    return sorted(found, key=lambda download: (-download.size, download.path))
 
 
 def _comparison(

@@ -32,11 +32,6 @@ def duration(seconds: float | None) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def megabytes(size: int) -> str:
-    """A file's size: 812 kB, 4.1 MB."""
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
-
-
 def plain(value: Any) -> str:
     """Any JSON value on one line."""
     match value:

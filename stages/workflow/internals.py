@@ -216,6 +216,7 @@ _END = re.compile(r"(returned non-zero exit status (\d+)|died with <Signals\.\w+
 _SIGKILL, _SIGINT = 9, 2
 _DISK_FULL = f"[Errno {errno.ENOSPC}]"
 _NOTHING_TO_DO = "Nothing to be done"
+_SUBMITTED = re.compile(r"Job \S+ has been submitted with SLURM jobid (\d+)")
 _CANCELLED = "Terminating processes on user request"
 # Messages before the first job that have no event, and those after a failed job, whose error the
 # display has shown.
@@ -293,6 +294,8 @@ class RunHandler(LogHandlerBase):
                 full = _DISK_FULL in text
                 short = "Snakemake cannot write its own files: the disk is full"
                 self._listener.message(short if full else text)
+        elif submitted := _SUBMITTED.match(text):
+            self._listener.message(f"  submitted  Slurm job {submitted[1]}")
         elif text.startswith(_CANCELLED):
             self._listener.cancelled()
         elif event is None and not self._knows_jobs and not text.startswith(_ROUTINE):

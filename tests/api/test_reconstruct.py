@@ -20,12 +20,12 @@ import splatmake
 from splatmake import UserError, reconstruction
 
 
-def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> dict[str, Any]:
+def pipeline(monkeypatch: pytest.MonkeyPatch, code: str) -> list[Any]:
     """Let this Python code be the pipeline; returns the arguments that it is called with."""
-    called: dict[str, Any] = {}
+    called: list[Any] = []
 
-    def command(folder: Path, name: str | None, how: Any) -> list[str]:
-        called.update(vars(how), scene=folder)
+    def command(*arguments: Any) -> list[str]:
+        called.extend(arguments)
         return [sys.executable, "-c", code]
 
     monkeypatch.setattr(reconstruction, "run_command", command)
@@ -68,7 +68,8 @@ def test_output_is_shown_on_request(
         splatmake.reconstruct("photos", tmp_path / "new", cores=3, progress=progress)
     out, err = capfd.readouterr()
     assert out == "" and err == (f"training {tmp_path / 'new'}\n" if progress else "")
-    assert called["cores"] == "3" and called["scene"] == Path("photos").absolute()
+    folder, name, how = called
+    assert (folder, name, how.cores) == (Path("photos").absolute(), None, "3")
 
 
 @pytest.mark.parametrize(

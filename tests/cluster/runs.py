@@ -110,9 +110,14 @@ class Running:
     def text(self) -> str:
         return self.file.read_text()
 
+    def log(self) -> str:
+        """Snakemake's own messages, of all runs in the project."""
+        files = sorted(self.project.glob(".snakemake/log/*.log"))
+        return "".join(file.read_text() for file in files)
+
     def submitted(self) -> list[str]:
         """The ids of its Slurm jobs."""
-        return re.findall(r"SLURM jobid (\d+)", self.text())
+        return re.findall(r"Slurm job (\d+)", self.text())
 
     def next_job(self, count: int) -> str:
         """The id of the job that is submitted after ``count`` others."""

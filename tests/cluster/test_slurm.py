@@ -28,6 +28,7 @@ from tests.cluster.runs import (
     until,
     with_poses,
 )
+from tests.e2e import transcripts
 from tests.e2e.harness import (
     TINY,
     copy_run,
@@ -209,7 +210,7 @@ def test_an_undisturbed_scene_is_three_jobs(
     undisturbed: Running, reference: Path, cluster: Cluster
 ) -> None:
     """Grouped stages: a scene does not queue for each of its eleven stages."""
-    undisturbed.finish()
+    transcripts.check("cluster", undisturbed.finish(), lines=40)
     assert len(undisturbed.submitted()) == 3
     assert Jobs(cluster).of(undisturbed.project, "-t", "all") == undisturbed.submitted()
     assert metrics(undisturbed.project, "tiny") == metrics(reference, "tiny")
@@ -281,7 +282,7 @@ def abandoned(
     cluster.stop_controller()
     # Without an answer, Snakemake's executor tries accounting, and again at the next check.
     query = "Falling back to 'sacct'"
-    until(lambda: run.text().count(query) >= 2, "a second status query without the controller")
+    until(lambda: run.log().count(query) >= 2, "a second status query without the controller")
     cluster.start_controller()
     until(lambda: jobs.field(old, "JobState") == "RUNNING", "the job after the controller's start")
     restarted += [tuple(jobs.field(old, name) for name in ("JobId", "JobState", "Restarts"))]

@@ -29,7 +29,6 @@ from pipeline.plan.values import StagePlan
 from pipeline.reporting.data import (
     Comparison,
     CoverageSection,
-    Download,
     SceneResults,
     TrainedScene,
     TrainingRecord,
@@ -204,8 +203,8 @@ def metrics(**changes) -> TimedMetrics:
             num_truth=49,
         ).model_dump(),
         "stages": {
-            "decode": {"skipped": True},
             "inspect": {"wall_s": 12.5, "cpu_s": 23.4, "peak_rss_mb": 345.0, "skipped": False},
+            "decode": {"skipped": True},
             "train": {"wall_s": 14.5, "cpu_s": 25.4, "peak_rss_mb": 347.0, "skipped": False},
         },
         "versions": {"torch": "2.13.0"},
@@ -222,13 +221,6 @@ def sparse(xyz: np.ndarray, rgb: np.ndarray | None = None) -> Points:
     return Points.without_tracks(xyz, np.zeros(xyz.shape, np.uint8) if rgb is None else rgb)
 
 
-PLAN = {
-    "inspect": StagePlan(run=True, reason="49 photographs"),
-    "decode": StagePlan(run=False, reason="no RAW"),
-    "train": StagePlan(run=True, reason="200 steps", inputs=["inspect"]),
-}
-
-
 def report(**changes) -> SceneResults:
     rng = np.random.default_rng(0)
     photograph, render = rng.integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
@@ -237,8 +229,7 @@ def report(**changes) -> SceneResults:
     lengths = rng.integers(2, 9, 300)
     data = SceneResults(
         metrics=metrics(),
-        plan=record_of(PLAN, ["it is dark"]),
-        downloads=[Download("export/scene.spz", 1_500_000)],
+        plan=record_of({"decode": StagePlan(run=False, reason="no RAW")}, ["it is dark"]),
         decisions={"sfm": ["incremental mapper: 49 images"], "train": []},
         curve=[
             TrainingRecord(CurveRecord(step=100, loss=0.2345, psnr=17.89, num_gaussians=5001), 3.0),

@@ -12,15 +12,13 @@ from pipeline.plan.values import StagePlan
 from pipeline.reporting.collect import collect_metrics
 from pipeline.reporting.headline import finished_line, headline, result_lines
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs, with_times
-from pipeline.reporting.verdict import judge
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.counters import NoCounters, StageCounters
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import RunRecord, StageRecord
 from tests.counters import INSPECT, REFINE, SFM, TRAIN
 from tests.plans import record_of
-from tests.reporting.made import coverage, evaluation
-from tests.reporting.made import metrics as made_metrics
+from tests.reporting.made import evaluation
 
 COUNTERS: dict[str, StageCounters] = {
     "inspect": INSPECT,
@@ -115,46 +113,16 @@ def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
     assert stages["decode"].wall_s == 0.0 and stages["sfm"].cpu_s == 6.0
 
 
-def test_the_result_has_grade_quality_size_poses_time_and_paths(folder):
+def test_the_result_has_quality_size_poses_time_and_paths(folder):
     line = "PSNR 27.50 dB, SSIM 0.9000, FLIP 0.080, 1,000 Gaussians, 6 of 8 photographs, 2 warnings"
     assert headline(read_metrics(folder)) == line
-    assert finished_line(folder) == f"barn: weak, {line}, 14 s"
-    coverage().record.write(folder / "coverage")
+    assert finished_line(folder) == f"barn: {line}, 14 s"
     (folder / "export").mkdir()
     for name in ("scene.spz", "stage.json"):
         (folder / "export" / name).touch()
     lines = result_lines(folder)
-    assert lines[0] == "barn: Weak: 6 of 8 photographs placed; sharp where photographed"
-    assert lines[1:3] == [f"  {line}, 14 s", f"  page     {folder / 'report.html'}"]
-    assert lines[3] == f"  exports  {folder / 'export'}: scene.spz"
-
-
-@pytest.mark.parametrize(
-    ("changes", "grade", "said"),
-    [
-        ({}, "good", "47 of 49 photographs placed; sharp"),
-        ({"registered_images": 49}, "good", "all 49 photographs placed; sharp"),
-        ({"registered_images": 30}, "weak", "30 of 49 photographs placed; sharp"),
-        ({"registered_images": None, "sfm_verdict": None}, "good", "Good: sharp"),
-        ({"sfm_verdict": "weak"}, "weak", "their positions are uncertain"),
-        ({"psnr": 22.0, "train_psnr": 30.0}, "weak", "soft in between"),
-        ({"psnr": 16.0, "train_psnr": 17.0}, "poor", "blurred, and unlike the photographs"),
-    ],
-)
-def test_the_verdict_follows_poses_and_sharpness(changes, grade, said):
-    verdict = judge(made_metrics(**changes))
-    assert verdict.grade == grade and said in verdict.sentence
-
-
-def test_the_verdict_names_holes_and_what_one_photograph_shows():
-    record = coverage().record
-    holes = [view.model_copy(update={"hole_share": 0.2}) for view in record.views]
-    verdict = judge(made_metrics(), record.model_copy(update={"views": holes}))
-    assert verdict.grade == "weak" and "holes in 20% of the picture" in verdict.sentence
-    seen = record.surface.seen_by.model_copy(update={"one": 0.3})
-    surface = record.surface.model_copy(update={"seen_by": seen})
-    verdict = judge(made_metrics(), record.model_copy(update={"surface": surface}))
-    assert verdict.grade == "good" and "30% of the surface is in one photo" in verdict.sentence
+    assert lines[:2] == [f"barn: {line}, 14 s", f"  page     {folder / 'report.html'}"]
+    assert lines[2] == f"  exports  {folder / 'export'}: scene.spz"
 
 
 @pytest.mark.parametrize("name", ["report/metrics.json", "sfm/run.json"])

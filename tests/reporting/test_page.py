@@ -62,21 +62,15 @@ class Page(HTMLParser):
 def test_every_number_is_on_the_page() -> None:
     text = Page(report_html(report())).all_text()
     shown = [
-        *("Good: 47 of 49 photographs placed", "4.3 %", "47 of 49", "scene.spz 1.5 MB"),
         *("27.35", "0.8765", "0.1235", "123,456", "47 / 49", "0.457", "0.0321", "0.00456"),
         *("21.99", "0.7123", "0.2345", "33.46", "0.9321", "0.0456"),
         *("12.5 s", "23.4 s", "345 MB", "14.5 s", "347 MB", "27.0 s", "2.13.0", "17"),
         *("17.89 dB", "23.45 dB", "0.1234", "7,003", "640x480", "every 8th", "a window"),
-        *(
-            "because of decode",
-            "Not needed: ",
-            "incremental mapper: 49 images",
-            "300 sparse points",
-        ),
+        *("because of decode", "skipped", "incremental mapper: 49 images", "300 sparse points"),
         *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
         *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 blocks"),
         *("0.222 (11.1% of blocks)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
-        *("63 % of this view is guessed today", "settles 17 % of all that is guessed"),
+        *("63 % of this view is unknown", "add 17 % of the trust that is missing"),
         *("1 test cameras", "4 training", "1.0: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
@@ -91,14 +85,13 @@ def test_metrics_and_plan_are_embedded_verbatim() -> None:
 
 def test_no_network_requests() -> None:
     html = report_html(report())
-    html = html.replace('xmlns="http://www.w3.org/2000/svg"', "")
     assert "http:" not in html and "https:" not in html and "//cdn" not in html
     assert "@import" not in html and "url(" not in html
     page = Page(html)
     for tag, attrs in page.tags:
         for name in ("src", "href", "action", "data", "srcset", "poster"):
             value = attrs.get(name)
-            assert value is None or value.startswith(("data:", "#", "export/")), (tag, name, value)
+            assert value is None or value.startswith(("data:", "#")), (tag, name, value)
     policies = [a["content"] for t, a in page.tags if "http-equiv" in a and t == "meta"]
     assert len(policies) == 1 and policies[0] is not None
     assert policies[0].startswith("default-src 'none'")
@@ -195,19 +188,22 @@ def test_missing_values_are_accepted(changes) -> None:
     assert ">nan<" not in html and not re.search(r"(?<![\w+/])NaN(?![\w+/=])", apart)
 
 
+def test_a_scene_without_warnings_says_so() -> None:
+    assert "No warnings" in Page(report_html(report(metrics=metrics(warnings=[])))).all_text()
+
+
 def test_missing_lpips_shows_the_reason() -> None:
     changed = metrics(lpips=None, lpips_reason="weights not found: put them there")
     text = Page(report_html(report(metrics=changed))).all_text()
-    assert "LPIPS was not measured: weights not found: put them there" in text
-    assert "n/a" not in text
+    assert "LPIPS n/a weights not found: put them there" in text
 
 
-def test_a_deviation_from_a_published_protocol_is_said() -> None:
+def test_a_deviation_from_a_published_protocol_is_at_the_top() -> None:
     def lead(*deviations: str) -> str:
         benchmark = {"benchmark": "NeRF-synthetic", "scene": "lego", "deviations": deviations}
         published = PublishedProtocol.model_validate(benchmark)
         protocol = metrics().protocol.model_copy(update={"published": published})
-        return report_html(report(metrics=metrics(protocol=protocol)))
+        return report_html(report(metrics=metrics(protocol=protocol))).split("<nav>")[0]
 
     text = "lego of NeRF-synthetic, NOT as published: 40 test views, not 200"
     assert text in lead("40 test views, not 200")
@@ -217,25 +213,7 @@ def test_a_deviation_from_a_published_protocol_is_said() -> None:
 def test_warnings_come_first_and_once() -> None:
     html = report_html(report())
     assert html.count("<li>it is dark</li>") == 1
-    assert html.index('class="warnings"') < html.index('<section id="pictures"')
-
-
-def test_views_have_the_names_of_their_photographs() -> None:
-    """Undistorted photographs are files of their own."""
-    text = report_html(report(own_names={"0.jpg": "IMG_0.HEIC", "3.jpg": "IMG_3.HEIC"}))
-    before = report_html(report())
-    shown = re.sub(r"<pre>.*?</pre>", "", text, flags=re.S)
-    assert "0.jpg" in before and not re.search(r"\b[03]\.jpg", shown)
-    assert shown.count("IMG_0.HEIC") == re.sub(r"<pre>.*?</pre>", "", before, flags=re.S).count(
-        "0.jpg"
-    )
-
-
-def test_stages_are_in_the_order_of_the_work() -> None:
-    text = Page(report_html(report())).all_text()
-    names = [name for name in report().plan.order if report().plan.runs(name)]
-    rows = [text.index(f" {name} ", text.index("Time CPU Memory")) for name in names]
-    assert rows == sorted(rows)
+    assert html.index('class="warnings"') < html.index("<section")
 
 
 def test_the_same_data_gives_the_same_bytes(tmp_path: Path) -> None:

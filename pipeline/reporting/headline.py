@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ def result_lines(folder: Path) -> list[str]:
         finished_line(folder),
         f"  page     {folder / 'report.html'}",
         *([f"  exports  {folder / 'export'}: {', '.join(files)}"] if files else []),
-        f"  next     {COMMAND} view {folder}",
+        f"  next     {COMMAND} view {shlex.quote(str(folder))}",
     ]
 
 

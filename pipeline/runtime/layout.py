@@ -12,8 +12,8 @@ PACKAGES = Path(__file__).resolve().parents[2]
 
 IS_CHECKOUT = (PACKAGES / "Snakefile").is_file()
 
-COMMAND = "python -m pipeline" if IS_CHECKOUT else "splatmake"
-"""The command line of the program, for messages."""
+COMMAND = "splatmake"
+"""The command line of the program, for messages. ``make setup`` makes it in a checkout."""
 
 WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 """The folder of the Snakefile and of ``profiles/``; setup.py copies them there."""

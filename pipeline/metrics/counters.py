@@ -18,6 +18,5 @@ class EvaluateCounters(StageCounters):
     )
 
     def headline(self) -> str:
-        flip = "" if self.flip is None else f", FLIP {self.flip:.3f}"
         lpips = "" if self.lpips is None else f", LPIPS {self.lpips:.3f}"
-        return f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}{flip}{lpips}"
+        return f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, FLIP {self.flip:.3f}{lpips}"

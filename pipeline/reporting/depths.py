@@ -51,9 +51,7 @@ def coarse_depths(
     return depths
 
 
-def _absorb(
-    depth: Array, means: Array, areas: Array, camera: dict[str, Any], near: float
-) -> None:
+def _absorb(depth: Array, means: Array, areas: Array, camera: dict[str, Any], near: float) -> None:
     """Write the coarse depth map of one camera to ``depth``, (ROWS * COLUMNS,)."""
     pose = np.reshape(camera["world_to_camera"], (3, 4))
     local = means @ pose[:, :3].T + pose[:, 3]

@@ -115,6 +115,10 @@ def make_parser(program: str = "splatmake") -> Parser:
         "updated twice a minute."
     )
     _add_view(command("view", _view, text, "results/garden", about))
+    text = "write a folder to upload: the page and its files"
+    about = "Write a folder to upload: the page of a scene and its exported files."
+    add = command("publish", _publish, text, "results/garden upload/garden", about)
+    _add_publish(add)
     text = "convert Gaussians to another file format"
     example = "point_cloud.ply garden.spz --min-opacity 0.02"
     _add_convert(command("convert", _convert, text, example))
@@ -284,6 +288,18 @@ def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> Non
 
     use_device(device)
     serve(Source(model, cameras), **options)
+
+
+def _add_publish(add: Callable[..., object]) -> None:
+    add("scene", type=Path, metavar="SCENE", help="finished scene: results/NAME")
+    text = "folder to write: new, empty, or published before"
+    add("target", type=Path, metavar="DIR", help=text)
+
+
+def _publish(**options: Any) -> None:
+    from pipeline.reporting.publish import publish
+
+    _print(publish(**options))
 
 
 def _add_compare(add: Callable[..., object]) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pipeline.io.spz import decode_spz, encode_spz
+from pipeline.reporting.depths import DEPTH_RATIO, coarse_depths, depth_codes
 from pipeline.reporting.fit import Packed, fit, prominence
 from pipeline.reporting.page import report_html
 from pipeline.reporting.pictures import upright
@@ -220,3 +221,29 @@ def test_pages_are_written_without_torch() -> None:
     modules = "pipeline.reporting.scene, pipeline.reporting.page, pipeline.reporting.collect"
     code = f"import {modules}, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_coarse_depths_are_those_of_the_nearest_opaque_surface() -> None:
+    """A wall at 4 fills the image, behind it one at 8; a thin veil at 1; sky in the upper rows."""
+    view = ring(1)[0]
+    pose = np.eye(4)
+    view = dataclasses.replace(view, world_to_camera=pose, cx=100.0, cy=75.0)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)))
+    below = y > 0.02
+    walls = [np.column_stack([z * x, z * y, np.full(len(x), z)])[below] for z in (1.0, 4.0, 8.0)]
+    made = gaussians(3 * below.sum(), degree=0)
+    made.means[:] = np.concatenate(walls)
+    made.log_scales[:] = np.log(0.03 * made.means[:, 2:])
+    made.opacity_logits[:] = np.repeat([-5.0, 3.0, 3.0], below.sum())
+    depths = coarse_depths(made, [upright_camera(view, 1)], 0.1)[0]
+    np.testing.assert_allclose(depths[7:], 4, rtol=1e-6)
+    assert np.isinf(depths[:5]).all()
+    codes = depth_codes(depths, 0.1)
+    assert not codes[:5].any()
+    np.testing.assert_allclose(0.1 * DEPTH_RATIO ** (codes[7:] - 1.0), 4, rtol=0.03)
+
+
+def test_the_poster_is_in_the_page_before_the_gaussians() -> None:
+    views = [dataclasses.replace(v, name="1.jpg") for v in report().comparisons]
+    html = report_html(report(comparisons=views))
+    assert 0 < html.index('class="poster"') < html.index('id="splats"')

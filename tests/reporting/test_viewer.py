@@ -69,7 +69,7 @@ def page(browser: Any) -> Iterator[Any]:
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
     base = report(trained=trained(gaussians=gaussians(1500)))
-    red = np.full((150, 200, 3), (255, 0, 0), np.uint8)
+    red = np.full_like(base.comparisons[0].photograph, (255, 0, 0))
     shown = dataclasses.replace(
         base.comparisons[0], label="median", name="2.jpg", photograph=red, mask=None
     )
@@ -97,7 +97,9 @@ def pixels(png: bytes) -> Pixels:
 
 
 def canvas(page: Any) -> Pixels:
-    return pixels(page.locator("#space canvas").screenshot())
+    """Without the texts over it and its edge, which depend on where the page is scrolled to."""
+    style = "#space :is(.bar, .corner, .activate) { visibility: hidden; }"
+    return pixels(page.locator("#space canvas").screenshot(style=style))[2:-2, 2:-2]
 
 
 def changed(page: Any, before: Pixels) -> None:
@@ -216,7 +218,7 @@ def test_pyramids_are_drawn_at_a_camera_too(scene: Any) -> None:
     """Those of the other cameras, however near they are."""
     scene.get_by_role("button", name="next camera").click()  # Without a photograph over it.
     bare = settled(scene)
-    scene.get_by_label("Cameras").check()
+    scene.locator("#space-tools").get_by_label("Cameras").check()
     changed(scene, bare)
 
 
@@ -236,10 +238,8 @@ def test_the_wheel_is_the_pages_until_the_scene_is_clicked(scene: Any) -> None:
             until(lambda: scene.evaluate("scrollY") > top)
         else:
             until(lambda: state(scene)["pose"] != pose)
-        assert (scene.evaluate("scrollY") > top, state(scene)["pose"] != pose) == (
-            scrolls,
-            not scrolls,
-        )
+        assert (scene.evaluate("scrollY") > top) == scrolls
+        assert (state(scene)["pose"] != pose) != scrolls
 
     scene.mouse.move(x, y)
     wheel(scrolls=True)
@@ -275,7 +275,7 @@ def test_the_divider_in_the_viewer_uncovers_the_render(scene: Any) -> None:
     slider = scene.locator("#space .photograph input")
 
     def reds() -> Pixels:
-        return (settled(scene) == (255, 0, 0)).all(2)
+        return (np.abs(settled(scene).astype(int) - (255, 0, 0)) < 16).all(2)
 
     half = reds()
     left, right = np.array_split(half, 2, axis=1)
@@ -303,19 +303,20 @@ def test_one_finger_scrolls_the_page_until_the_scene_is_tapped(browser: Any, fil
         page = context.new_page()
         page.goto(file.as_uri())
         page.evaluate("viewer.ready")
-        page.evaluate(
-            "document.getElementById('space').scrollIntoView("
-            "{block: 'center', behavior: 'instant'})"
-        )
+        page.add_style_tag(content="html { scroll-behavior: auto !important }")
+        page.evaluate("document.getElementById('space').scrollIntoView({block: 'center'})")
         touch = context.new_cdp_session(page)
 
         def swipe() -> tuple[bool, bool]:
             """Up across the scene: whether the page scrolled, and whether the view turned."""
             area = page.locator("#space").bounding_box()
             top, pose = page.evaluate("scrollY"), state(page)["pose"]
-            where = {"x": area["x"] + 60, "y": area["y"] + area["height"] / 2}
-            gesture = {"yDistance": -80, "gestureSourceType": "touch", "preventFling": True}
-            touch.send("Input.synthesizeScrollGesture", where | gesture)
+            x, y = area["x"] + 60, area["y"] + area["height"] / 2
+            for i in range(8):
+                kind, point = "touchMove" if i else "touchStart", {"x": x, "y": y - 12 * i}
+                touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [point]})
+            touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+            time.sleep(0.5)
             return page.evaluate("scrollY") > top, state(page)["pose"] != pose
 
         assert swipe() == (True, False)
@@ -343,7 +344,7 @@ def load_world(page: Any, tmp_path: Path, world: World) -> None:
     write_report(report(trained=world.scene), path)
     page.goto(path.as_uri())
     page.evaluate("viewer.ready")
-    page.evaluate(GESTURES)
+    page.add_script_tag(content=GESTURES)
 
 
 def in_world(page: Any, world: World, seen: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -371,7 +372,7 @@ def test_no_gesture_loses_the_subject(page: Any, tmp_path: Path, world: World) -
         for done, seen in zip(made, page.evaluate("gestures => play(gestures)", made), strict=True):
             viewpoint, depths = in_world(page, world, seen)
             assert world.allows(viewpoint), (done, viewpoint)
-            assert len(depths) >= 0.04 * len(world.subject), (done, viewpoint)
+            assert len(depths) >= 10, (done, viewpoint)
             assert 0.2 * world.distance < np.median(depths) < 1.8 * world.distance, done
         picture = settled(page).reshape(-1, 3).astype(int)
         common = np.median(picture, axis=0)
@@ -384,8 +385,9 @@ def test_one_orbits_as_far_as_the_photographs_reach(
 ) -> None:
     """All round an object; a facade or a wall from its front only."""
     load_world(page, tmp_path, world)
-    drags = [{"kind": "drag", "values": [0, 0, 0.3, 0, 0, 0]}] * 24
-    states = page.evaluate("gestures => play(gestures)", drags)
+    drags = [{"kind": "drag", "values": [0, 0, way, 0, 0, 0]} for way in (0.3, -0.3)]
+    made = [drags[0]] * 12 + [drags[1]] * 24
+    states = page.evaluate("gestures => play(gestures)", made)
     towards = np.array([np.subtract(s["pose"][12:15], s["pivot"]) for s in states])
     angles = np.unwrap(np.arctan2(towards[:, 0], towards[:, 2]))
     turned = np.degrees(np.ptp(angles))

@@ -88,7 +88,7 @@ def an_object() -> World:
     eyes = [((4 * np.cos(a), 4 * np.sin(a), 1.2), (0, 0, 0)) for a in angles]
 
     def allows(eye: Array) -> bool:
-        return 1.2 < np.linalg.norm(eye) < 6 and abs(eye[2]) < 4.5
+        return bool(1.05 < np.linalg.norm(eye) < 6 and abs(eye[2]) < 4.5)
 
     return world("object", ball, eyes, allows, (300, 1e9), 0.08)
 
@@ -100,7 +100,7 @@ def a_facade() -> World:
     eyes = [((x, -5, 1.7), (0.6 * x, 0, 2.5)) for x in np.linspace(-4, 4, 9)]
 
     def allows(eye: Array) -> bool:
-        return -7.5 < eye[1] < -0.8 and abs(eye[0]) < 9
+        return bool(-7.5 < eye[1] < -0.8 and abs(eye[0]) < 9)
 
     return world("facade", wall, eyes, allows, (15, 150), 0.12)
 

@@ -130,7 +130,7 @@ function start(data) {
     name.textContent = camera.name;
     tools.elements.view.value = index;
     resize();
-    orbit.show({ position, pivot, up, limits: coverage.around(pivot, index), arrived }, animate);
+    orbit.show({ position, pivot, up, limits: coverage.around(pivot, { own: index }), arrived }, animate);
   }
 
   function showOverview() {
@@ -139,15 +139,15 @@ function start(data) {
     for (const { position } of cameras) mean.add(position.clone().sub(coverage.centre).normalize());
     const up = new THREE.Vector3(0, 1, 0);
     const yaw = Math.atan2(mean.x, mean.z) + 0.4;
-    const direction = new THREE.Vector3(Math.sin(yaw), 0.6, Math.cos(yaw)).normalize();
-    limits?.turn(direction, up);
+    const offset = new THREE.Vector3(Math.sin(yaw), 0.6, Math.cos(yaw));
+    offset.setLength(2.4 * coverage.reach);
     current = null;
     lens = OVERVIEW;
     name.textContent = "overview";
     tools.elements.view.value = "";
     tools.elements.cameras.checked = frusta.visible = true;
     resize();
-    const position = direction.multiplyScalar(2.4 * coverage.reach).add(coverage.centre);
+    const position = (limits ? limits.clamp(offset, up) : offset).add(coverage.centre);
     orbit.show({ position, pivot: coverage.centre.clone(), up, limits, arrived }, false);
   }
 

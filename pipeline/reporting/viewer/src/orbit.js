@@ -59,13 +59,8 @@ export class Orbit {
 
   // Go to `offset` from `pivot`, or as near to it as the limits allow.
   #go(offset, pivot = this.pivot) {
-    let distance = offset.length();
-    const direction = offset.normalize();
-    if (this.limits) {
-      this.limits.turn(direction, this.up);
-      distance = this.limits.distance(direction, distance);
-    }
-    this.#place(direction.multiplyScalar(distance).add(pivot), pivot.clone(), this.up.clone());
+    const found = this.limits ? this.limits.clamp(offset, this.up) : offset;
+    this.#place(found.add(pivot), pivot.clone(), this.up.clone());
   }
 
   // Angles in radians: to the right, and upwards.
@@ -83,8 +78,8 @@ export class Orbit {
     this.#go(this.#offset().multiplyScalar(factor));
   }
 
-  // Move the pivot and the viewpoint in the image plane, in multiples of the view's height; not to
-  // where no camera looked.
+  // Move the pivot and the viewpoint in the image plane, in multiples of the view's height; not
+  // into the air, nor to where no camera looked.
   pan(x, y) {
     cancelAnimationFrame(this.flight);
     const offset = this.#offset();
@@ -92,7 +87,7 @@ export class Orbit {
     const axis = column => new THREE.Vector3().setFromMatrixColumn(this.camera.matrixWorld, column);
     const pivot = this.pivot.clone()
       .addScaledVector(axis(0), -x * height).addScaledVector(axis(1), y * height);
-    const limits = this.coverage.around(pivot);
+    const limits = this.coverage.around(pivot, { solid: true });
     if (!limits) return;
     this.limits = limits;
     this.panned = true;
@@ -104,9 +99,8 @@ export class Orbit {
     const limits = this.panned && point && this.coverage.around(point);
     this.panned = false;
     if (!limits) return;
-    const offset = this.camera.position.clone().sub(point), distance = offset.length();
-    const direction = offset.normalize(), turned = limits.turn(direction.clone(), this.up);
-    if (turned.angleTo(direction) > 1e-3 || limits.distance(direction, distance) !== distance) return;
+    const offset = this.camera.position.clone().sub(point);
+    if (limits.clamp(offset, this.up).distanceTo(offset) > 1e-3 * offset.length()) return;
     this.pivot.copy(point);
     this.limits = limits;
   }
@@ -115,11 +109,8 @@ export class Orbit {
   focus(point, share, animate) {
     const limits = this.coverage.around(point);
     if (!limits) return false;
-    const offset = this.camera.position.clone().sub(point);
-    const distance = share * offset.length();
-    const direction = limits.turn(offset.normalize(), this.up);
-    const position = direction.clone()
-      .multiplyScalar(limits.distance(direction, distance)).add(point);
+    const offset = this.camera.position.clone().sub(point).multiplyScalar(share);
+    const position = limits.clamp(offset, this.up).add(point);
     this.show({ position, pivot: point, up: this.up.clone(), limits }, animate);
     return true;
   }

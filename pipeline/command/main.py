@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   splatmake render scene.spz --cameras data/garden/sparse/0 -o renders
   splatmake evaluate point_cloud.ply --scene results/garden
   splatmake compare results/benchmark.json --base balanced
+  splatmake publish results/garden upload/garden
   splatmake doctor
 
 In a checkout, `python -m pipeline` is the same command, and
@@ -108,6 +109,8 @@ def make_parser() -> argparse.ArgumentParser:
         "the newest checkpoint is shown and updated twice a minute."
     )
     _add_view(command("view", _view, text, about))
+    text = "write a folder to upload: the page of a scene and its exported files"
+    _add_publish(command("publish", _publish, text))
     text = "tables of a batch (results/benchmark.json), or of two"
     about = (
         "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
@@ -286,6 +289,18 @@ def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> Non
 
     use_device(device)
     serve(Source(model, cameras), **options)
+
+
+def _add_publish(add: Callable[..., object]) -> None:
+    add("scene", type=Path, metavar="SCENE", help="finished scene: results/NAME")
+    text = "folder to write: new, empty, or published before"
+    add("target", type=Path, metavar="DIR", help=text)
+
+
+def _publish(**options: Any) -> None:
+    from pipeline.reporting.publish import publish
+
+    _print(publish(**options))
 
 
 def _add_compare(add: Callable[..., object]) -> None:

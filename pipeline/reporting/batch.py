@@ -111,9 +111,11 @@ def row(result: Result, stages: Sequence[str] = ()) -> dict[str, Any]:
     return line | {name: result.machine.get(name) for name in MACHINE}
 
 
-def _sum(values: Iterable[float]) -> float | None:
+def _sum(values: Iterable[float | None]) -> float | None:
+    """The sum; None without values, or if one is not known."""
     found = list(values)
-    return round(sum(found), 3) if found else None
+    known = [value for value in found if value is not None]
+    return round(sum(known), 3) if known and len(known) == len(found) else None
 
 
 def as_csv(results: Sequence[Result], stages: Sequence[str] = ()) -> str:

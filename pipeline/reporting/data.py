@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import TimedMetrics
+from pipeline.reporting.publish import Download
 from pipeline.scene.blocks import Partition
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Points
@@ -127,6 +128,8 @@ class SceneResults:
         curve: The training curve.
         comparisons: The views to show, worst first.
         blocks: The trained blocks; None for a scene that was trained as one block.
+        photographs: The photograph's name for each view that has another name.
+        downloads: The exported files.
     """
 
     metrics: TimedMetrics
@@ -138,6 +141,8 @@ class SceneResults:
     curve: Sequence[TrainingRecord]
     comparisons: Sequence[Comparison]
     blocks: BlocksSection | None = None
+    photographs: Mapping[str, str] = field(default_factory=dict)
+    downloads: Sequence[Download] = ()
 
 
 def ranked(per_view: Sequence[ViewMetrics], count: int) -> list[tuple[Rank, ViewMetrics]]:

@@ -57,7 +57,9 @@ class TimedStage(StageStatus):
     """Whether a stage has run, and its cost."""
 
     wall_s: float = 0.0
-    cpu_s: float = 0.0
+    cpu_s: float | None = Field(
+        0.0, description="null for resumed work: that of earlier processes is not recorded."
+    )
     peak_rss_mb: float = 0.0
 
 
@@ -102,12 +104,12 @@ def together(runs: Sequence[RunRecord]) -> RunRecord:
 
 def with_times(metrics: Metrics, runs: Mapping[str, RunRecord]) -> TimedMetrics:
     """The metrics with the times of each stage, which are zero for skipped ones. Work that was
-    killed and resumed counts its earlier processes, too."""
+    killed and resumed counts its earlier processes, too, whose CPU time is not known."""
     shown = metrics.model_dump()
     for name, run in runs.items():
         shown["stages"][name] |= {
             "wall_s": round(run.wall_s + run.earlier_s, 3),
-            "cpu_s": run.cpu_s,
+            "cpu_s": None if run.earlier_s else run.cpu_s,
             "peak_rss_mb": run.peak_rss_mb,
         }
     return TimedMetrics.model_validate(shown)

@@ -18,11 +18,15 @@ from markupsafe import Markup
 from pipeline.reporting.blocks import blocks_map
 from pipeline.reporting.charts import histogram, line_chart
 from pipeline.reporting.coverage import coverage_content
+from pipeline.reporting.dag import plan_svg
 from pipeline.reporting.data import SceneResults, TrainingRecord
 from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
+from pipeline.reporting.names import with_photograph_names
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
+from pipeline.reporting.publish import MARK
 from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
+from pipeline.reporting.verdict import grouped_warnings, verdict
 from pipeline.runtime.atomic import write_text
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.scene.reconstruction import Points
@@ -48,6 +52,8 @@ def write_report(results: SceneResults, path: Path) -> None:
 
 def report_html(results: SceneResults) -> str:
     """The page as a string."""
+    raw = _embedded_records(results)
+    results = with_photograph_names(results)
     metrics = results.metrics
     masked = any(v.mask is not None and not v.mask.all() for v in results.comparisons)
     pictures = {
@@ -60,39 +66,64 @@ def report_html(results: SceneResults) -> str:
         "charts": _point_charts(results.points),
         "georeference": _georeference(metrics.georeference) if metrics.georeference else None,
     }
-    records = {"metrics.json": metrics, "plan.json": results.plan}
-    raw = {
-        name: json.dumps(record.model_dump(mode="json"), indent=2, ensure_ascii=False)
-        for name, record in records.items()
-    }
+    coverage = coverage_content(results)
     contents: list[tuple[str, str, Any]] = [
         ("pictures", "Photograph and render", pictures),
-        ("coverage", "Coverage by the photographs", coverage_content(results)),
+        ("coverage", "What to photograph next", coverage),
+        ("figures", "Figures", None),
+        ("views", "All test views", _measures(metrics)),
+        ("trust", "Coverage by the photographs", coverage),
         ("training", "Training", _curve_charts(results.curve)),
         ("reconstruction", "Reconstruction", reconstruction),
-        ("views", "All views", _measures(metrics)),
-        ("stages", "Stages", None),
+        ("stages", "Stages", plan_svg(results.plan)),
         ("how", "Decisions and protocol", raw),
     ]
     if results.blocks is not None:
-        contents.insert(2, ("blocks", "Blocks", blocks_map(results, results.blocks.partition)))
+        contents.insert(5, ("blocks", "Blocks", blocks_map(results, results.blocks.partition)))
     sections = [
-        Section(key, title, f"scene/{key}.html.jinja", content) for key, title, content in contents
+        Section(key, title, f"scene/{key}.html.jinja", content)
+        for key, title, content in contents
+        if key not in _missing(results)
     ]
 
     def page(viewer: ViewerContent) -> Markup:
-        first = Section("scene", "Scene", "scene/viewer.html.jinja", viewer)
         return render(
             "scene/page.html.jinja",
             results=results,
             metrics=metrics,
-            sections=[first, *sections],
+            verdict=verdict(results),
+            warnings=grouped_warnings(metrics.warnings, results.plan.order),
+            section=Section("scene", "Scene", "scene/viewer.html.jinja", viewer),
+            sections=sections,
+            mark=Markup(MARK),
             viewer=viewer_script(),
         )
 
     # The Gaussians get what the rest of the page leaves.
     rest = page(ViewerContent("", Markup(), "", viewer_poster(results)))
     return page(viewer_content(results, _MAX_BYTES - len(rest)))
+
+
+def _embedded_records(results: SceneResults) -> dict[str, str]:
+    """The records as they are in their files, by the files' names."""
+    records = {"metrics.json": results.metrics, "plan.json": results.plan}
+    return {
+        name: json.dumps(record.model_dump(mode="json"), indent=2, ensure_ascii=False)
+        for name, record in records.items()
+    }
+
+
+def _missing(results: SceneResults) -> set[str]:
+    """Sections without content, which the page leaves out."""
+    record = results.coverage.record
+    present = {
+        "pictures": results.comparisons,
+        "coverage": record.viewpoints,
+        "trust": not record.reason,
+        "training": results.curve,
+        "views": results.metrics.per_view,
+    }
+    return {name for name, content in present.items() if not content}
 
 
 def _curve_charts(curve: Sequence[TrainingRecord]) -> dict[str, list[Markup]]:

@@ -24,10 +24,13 @@ from pipeline.reporting.data import (
     ranked,
 )
 from pipeline.reporting.metrics import TimedMetrics, together
+from pipeline.reporting.names import photograph_names
+from pipeline.reporting.publish import downloads
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.json_file import mismatch
 from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.blocks import Partition
+from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Points
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.curve import TrainingCurve
@@ -44,7 +47,7 @@ def read_results(
     """Read the results of a scene.
 
     Args:
-        folders: The folders of inspect, train, evaluate and coverage, by stage.
+        folders: The folders of inspect, train, evaluate, coverage and export, by stage.
         metrics: The content of ``metrics.json`` with the times of the stages.
         plan: The plan of the scene.
         trained: The Gaussians and their views.
@@ -68,6 +71,11 @@ def read_results(
             for label, measured in ranked(metrics.per_view, shown)
         ],
         blocks=_blocks(plan, scene),
+        photographs=photograph_names(
+            [view.name for view in trained.views],
+            [photo.name for photo in Manifest.read(folders["inspect"] / "images.json").photos],
+        ),
+        downloads=downloads(folders["export"]),
     )
 
 

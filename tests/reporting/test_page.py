@@ -70,7 +70,7 @@ def test_every_number_is_on_the_page() -> None:
         *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
         *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 blocks"),
         *("0.222 (11.1% of blocks)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
-        *("63 % of this view is unknown", "add 17 % of the trust that is missing"),
+        *("63 % is unknown so far", "closes 17 % of all gaps around the scene"),
         *("1 test cameras", "4 training", "1.0: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
@@ -84,7 +84,7 @@ def test_metrics_and_plan_are_embedded_verbatim() -> None:
 
 
 def test_no_network_requests() -> None:
-    html = report_html(report())
+    html = report_html(report()).replace('xmlns="http://www.w3.org/2000/svg"', "")
     assert "http:" not in html and "https:" not in html and "//cdn" not in html
     assert "@import" not in html and "url(" not in html
     page = Page(html)
@@ -144,7 +144,10 @@ def test_no_string_of_the_user_becomes_markup() -> None:
     views = [dataclasses.replace(v, name="0.jpg") for v in report().comparisons]
     good, bad = Page(report_html(report(comparisons=views))), Page(report_html(data))
     scripts = [sum(tag == "script" for tag, _ in page.tags) for page in (good, bad)]
-    images = [sum(tag == "img" for tag, _ in page.tags) for page in (good, bad)]
+    images = [
+        sum(tag == "img" and attrs.get("class") != "poster" for tag, attrs in page.tags)
+        for page in (good, bad)
+    ]
     assert scripts[0] == scripts[1] and images[0] == images[1]
     assert not any(name.startswith("on") for _, attrs in bad.tags for name in attrs)
     assert NASTY in bad.all_text()
@@ -189,14 +192,36 @@ def test_missing_values_are_accepted(changes) -> None:
     assert ">nan<" not in html and not re.search(r"(?<![\w+/])NaN(?![\w+/=])", apart)
 
 
-def test_a_scene_without_warnings_says_so() -> None:
-    assert "No warnings" in Page(report_html(report(metrics=metrics(warnings=[])))).all_text()
+def test_what_was_not_measured_has_one_line_and_no_card() -> None:
+    changed = metrics(lpips=None, lpips_reason="weights not found: put them there", warnings=[])
+    html = report_html(report(metrics=changed))
+    text = Page(html).all_text().split("{ }")[0]
+    assert "LPIPS was not measured: weights not found." in text
+    assert "n/a" not in html.split("<details")[0] and 'class="warnings"' not in html
 
 
-def test_missing_lpips_shows_the_reason() -> None:
-    changed = metrics(lpips=None, lpips_reason="weights not found: put them there")
-    text = Page(report_html(report(metrics=changed))).all_text()
-    assert "LPIPS n/a weights not found: put them there" in text
+def test_stages_are_in_order_beside_the_picture_of_the_plan() -> None:
+    html = report_html(report())
+    rows = re.findall(r"<tr><td>(\w+)</td>", html[html.index('id="stages"') :])
+    assert rows == ["inspect", "train"] and '<svg class="plan"' in html
+
+
+def test_resumed_work_has_no_cpu_time_of_one_session_beside_the_wall_time_of_all() -> None:
+    stages = dict(metrics().stages)
+    stages["train"] = stages["train"].model_copy(update={"cpu_s": None})
+    text = Page(report_html(report(metrics=metrics(stages=stages)))).all_text()
+    assert "CPU time of the earlier ones is not recorded" in text and "CPU 48.8 s" not in text
+
+
+def test_photographs_have_their_own_names() -> None:
+    """In views, measures, pictures, coverage and texts; the records stay as their files are."""
+    names = {f"{i}.jpg": f"{i}.CR2" for i in range(5)} | {"a.jpg": "a.CR2", "b.jpg": "b.CR2"}
+    warnings = ["sfm: 2 photographs have no pose: a.jpg, b.jpg"]
+    html = report_html(report(photographs=names, metrics=metrics(warnings=warnings)))
+    records = html.index("<details><summary>metrics.json")
+    assert not re.findall(r"(?<!\w)[0-9ab]\.jpg", html[:records])
+    assert {"a.CR2", "1.CR2", "4.CR2"} <= set(re.findall(r"\w\.CR2", html[:records]))
+    assert "a.jpg" in html[records:]
 
 
 def test_a_deviation_from_a_published_protocol_is_at_the_top() -> None:
@@ -214,7 +239,7 @@ def test_a_deviation_from_a_published_protocol_is_at_the_top() -> None:
 def test_warnings_come_first_and_once() -> None:
     html = report_html(report())
     assert html.count("<li>it is dark</li>") == 1
-    assert html.index('class="warnings"') < html.index("<section")
+    assert html.index("What to know") < html.index("<section")
 
 
 def test_the_same_data_gives_the_same_bytes(tmp_path: Path) -> None:

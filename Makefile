@@ -83,7 +83,8 @@ test: setup $(VENV)/dev $(VENV)/gpu
 # compared with its reference, nothing is fuzzed.
 FAST_TESTS := $(addprefix tests/,config geometry io plan runtime scene splats metrics photos reporting \
   command training/density training/losses training/optimisers test_layers.py test_schemas.py \
-  test_reference_pages.py test_tools.py) --ignore=tests/io/clouds --ignore=tests/reporting/test_viewer.py
+  test_reference_pages.py test_tools.py) --ignore=tests/io/clouds --ignore=tests/reporting/test_viewer.py \
+  --ignore=tests/reporting/test_barriers.py
 test-fast: setup $(VENV)/dev
 	@$(BIN)/python -m pytest $(FAST_TESTS) -m "not slow" -n $(WORKERS) --dist worksteal
 

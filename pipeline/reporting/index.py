@@ -29,6 +29,7 @@ from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
 from pipeline.reporting.pictures import embedded, shrunk, upright
 from pipeline.reporting.text import count, duration, fixed
+from pipeline.reporting.verdict import TITLES, Grade, grade_of, worst
 
 _THUMBNAIL_PX = 240
 _THUMBNAIL_QUALITY = 84
@@ -96,6 +97,7 @@ class TableRow(NamedTuple):
         pages: The names of runs, and the texts of the links to their pages.
         deviations: How the runs deviate from the published protocol; None for no remark.
         published: Whether these are the figures of others.
+        verdict: The worst verdict on the runs, and its title; None for means over scenes.
     """
 
     label: str
@@ -103,6 +105,7 @@ class TableRow(NamedTuple):
     pages: Mapping[str, str] = {}
     deviations: str | None = None
     published: bool = False
+    verdict: tuple[Grade, str] | None = None
 
 
 class SceneContent(NamedTuple):
@@ -269,7 +272,9 @@ def _scene(batch: Batch, scene: str) -> SceneContent:
         runs = [(r, metrics) for r, metrics in done if r.run.config == config]
         pages = {r.run.name: f"seed {metrics.seed}" for r, metrics in runs}
         deviations = _deviations([metrics for _, metrics in runs]) if published else None
-        rows.append(TableRow(_label(config), _cells(spreads), pages, deviations))
+        grade = worst([grade_of(metrics) for _, metrics in runs])
+        told = grade, TITLES[grade]
+        rows.append(TableRow(_label(config), _cells(spreads), pages, deviations, verdict=told))
     for entry in published:
         cells = {
             name: (fixed(entry[name], min(digits, 3)), "")
@@ -334,7 +339,8 @@ def _cells(spreads: Mapping[str, Spread]) -> dict[str, tuple[str, str]]:
             off = fixed((s.high - s.low) / 2, digits) if s.count > 1 else ""
             cells[name] = fixed(s.mean, digits), off
     for name in ("wall_s", "cpu_s"):
-        cells[name] = duration(spreads[name].mean if name in spreads else None), ""
+        if name in spreads:
+            cells[name] = duration(spreads[name].mean), ""
     if "peak_rss_mb" in spreads:
         cells["peak_rss_mb"] = f"{count(spreads['peak_rss_mb'].mean)} MB", ""
     return cells

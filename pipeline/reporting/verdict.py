@@ -8,7 +8,7 @@ most of the surface has.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -20,7 +20,7 @@ from pipeline.reporting.metrics import Metrics
 Grade = Literal["good", "weak", "failed"]
 
 _WORST_FIRST: tuple[Grade, ...] = ("failed", "weak", "good")
-_TITLES: dict[Grade, str] = {"good": "Good", "weak": "Usable with care", "failed": "Failed"}
+TITLES: dict[Grade, str] = {"good": "Good", "weak": "Usable with care", "failed": "Failed"}
 _REMEDY = re.compile(r"^(.*) \(to improve it: (.*)\)$", re.DOTALL)
 _SIDE = re.compile(
     r"^(from|between) (.+?),.*?"
@@ -88,8 +88,12 @@ def render_grade(metrics: Metrics) -> Grade:
 
 def grade_of(metrics: Metrics) -> Grade:
     """The worst of the grades of poses and renders."""
-    grades = {metrics.sfm_verdict, render_grade(metrics)}
-    return next(grade for grade in _WORST_FIRST if grade in grades)
+    return worst([metrics.sfm_verdict, render_grade(metrics)])
+
+
+def worst(grades: Collection[str | None]) -> Grade:
+    """The worst of the grades that are known; good without one."""
+    return next((grade for grade in _WORST_FIRST if grade in grades), "good")
 
 
 def verdict(results: SceneResults) -> Verdict:
@@ -100,7 +104,7 @@ def verdict(results: SceneResults) -> Verdict:
     clauses = [_placed(metrics), _sharpness(metrics), _not_seen(record)]
     return Verdict(
         grade,
-        _TITLES[grade],
+        TITLES[grade],
         "; ".join(filter(None, clauses)) + ".",
         [figure for figure in figures if figure is not None],
     )
@@ -179,7 +183,8 @@ def grouped_warnings(warnings: Sequence[str], order: Sequence[str]) -> list[Warn
     found.sort(key=lambda entry: places.get(entry[0], -1))
     groups = []
     for title, stages in _GROUPS.items():
-        told, remedies = [], []
+        told: list[str] = []
+        remedies: list[str] = []
         for stage, text in found:
             if stage in stages and (split := _REMEDY.match(text)):
                 told.append(split[1])

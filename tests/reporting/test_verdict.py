@@ -35,7 +35,7 @@ def test_the_grade_is_the_worst_of_poses_and_renders(changes, grade: str, words:
     ("description", "words"),
     [
         (
-            "from a b.jpg, 39% to the left (of it), looking at what c.jpg shows",
+            "from a b.jpg, 39% to the left (of it), looking at c.jpg",
             "to the left of a b.jpg",
         ),
         ("from a.jpg, 12% higher, 3% to the right", "above a.jpg"),

@@ -9,6 +9,7 @@ const BEHIND = 1.5; // a point this much deeper than the depth map is hidden
 const BEFORE = 0.6; // one at less than this part of its depth is in the air
 const MEETING = [0.7, 1.6]; // depths, likewise, at which the cameras' axes meet within an object
 const ASIDE = 12; // degrees between a camera's axis and that point
+const OPEN = 1.2; // the depth map of a camera that sees the viewpoint, as a multiple of its depth
 const SLACK = [15, 45]; // degrees from the nearest camera's direction
 const MAX_DIRECTIONS = 200; // of a pivot; more cameras are thinned
 const RISE = 0.2; // above the highest camera and below the lowest, as a multiple of the pivot's depth
@@ -145,6 +146,18 @@ export class Coverage {
     });
     return seen.length && !(solid && air > 0.4 * seen.length)
       ? new Limits(pivot, seen, { heights: this.heights }) : null;
+  }
+
+  // Whether a viewpoint that orbits `pivot` is in the open: not behind the surface that most cameras
+  // on its side see there, nor close before it.
+  isOpen(viewpoint, pivot) {
+    const towards = viewpoint.clone().sub(pivot);
+    const found = this.cameras.flatMap(({ position }, index) => {
+      if (position.clone().sub(pivot).dot(towards) <= 0) return [];
+      const clearance = this.#clearance(index, viewpoint);
+      return clearance === null ? [] : [clearance];
+    });
+    return !found.length || fraction(found, 0.5) >= OPEN;
   }
 
   // The limits of the overview: all cameras, from farther away.

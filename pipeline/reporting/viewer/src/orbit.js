@@ -57,10 +57,21 @@ export class Orbit {
     return this.camera.position.clone().sub(this.pivot);
   }
 
-  // Go to `offset` from `pivot`, or as near to it as the limits allow.
-  #go(offset, pivot = this.pivot) {
-    const found = this.limits ? this.limits.clamp(offset, this.up) : offset;
-    this.#place(found.add(pivot), pivot.clone(), this.up.clone());
+  // Go to `offset` from `pivot`, or as near to it as the limits allow. Return false, without moving,
+  // if that is not in the open.
+  #go(offset, pivot = this.pivot, limits = this.limits) {
+    const position = this.#allowed(offset, pivot, limits);
+    if (!position) return false;
+    this.limits = limits;
+    this.#place(position, pivot.clone(), this.up.clone());
+    return true;
+  }
+
+  // The position that the limits allow; null if it is not in the open.
+  #allowed(offset, pivot, limits) {
+    if (!limits) return offset.clone().add(pivot);
+    const position = limits.clamp(offset, this.up).add(pivot);
+    return limits.heights && !this.coverage.isOpen(position, pivot) ? null : position;
   }
 
   // Angles in radians: to the right, and upwards.
@@ -89,9 +100,7 @@ export class Orbit {
       .addScaledVector(axis(0), -x * height).addScaledVector(axis(1), y * height);
     const limits = this.coverage.around(pivot, { solid: true });
     if (!limits) return;
-    this.limits = limits;
-    this.panned = true;
-    this.#go(offset, pivot);
+    if (this.#go(offset, pivot, limits)) this.panned = true;
   }
 
   // After panning, orbit around `point`, which is on the view's axis, if its limits allow this view.
@@ -110,7 +119,8 @@ export class Orbit {
     const limits = this.coverage.around(point);
     if (!limits) return false;
     const offset = this.camera.position.clone().sub(point).multiplyScalar(share);
-    const position = limits.clamp(offset, this.up).add(point);
+    const position = this.#allowed(offset, point, limits);
+    if (!position) return false;
     this.show({ position, pivot: point, up: this.up.clone(), limits }, animate);
     return true;
   }

@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.config.runs import Run
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs
+from pipeline.reporting.verdict import verdict
 from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.text import counted, duration, shortened
 
@@ -33,13 +34,13 @@ def headline(metrics: Metrics) -> str:
 
 
 def finished_line(folder: Path) -> str:
-    """One line on a finished run: its result, and the time that all its stages took.
+    """One line on a finished run: its grade, its result, and the time that all its stages took.
 
     Raises:
         UserError: A record of the run is missing or damaged.
     """
     metrics = read_metrics(folder)
-    return f"{metrics.scene}: {_with_time(metrics, folder)}"
+    return f"{metrics.scene}: {verdict(metrics).title}: {_with_time(metrics, folder)}"
 
 
 def result_lines(folder: Path) -> list[str]:
@@ -53,8 +54,11 @@ def result_lines(folder: Path) -> list[str]:
     """
     exported = sorted(file.name for file in (folder / "export").glob("[!.]*.*"))
     files = [name for name in exported if name not in ("stage.json", "run.json")]
+    metrics = read_metrics(folder)
+    found = verdict(metrics)
     return [
-        finished_line(folder),
+        f"{metrics.scene}: {found.title}: {found.sentence}",
+        f"  {_with_time(metrics, folder)}",
         f"  page     {folder / 'report.html'}",
         *([f"  exports  {folder / 'export'}: {', '.join(files)}"] if files else []),
         f"  next     {COMMAND} view {shlex.quote(str(folder))}",

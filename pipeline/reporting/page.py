@@ -91,7 +91,7 @@ def report_html(results: SceneResults) -> str:
             "scene/page.html.jinja",
             results=results,
             metrics=metrics,
-            verdict=verdict(results),
+            verdict=verdict(metrics, results.coverage.record),
             warnings=grouped_warnings(metrics.warnings, results.plan.order),
             section=Section("scene", "Scene", "scene/viewer.html.jinja", viewer),
             sections=sections,

@@ -14,7 +14,6 @@ from typing import Literal, NamedTuple
 
 from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluate import LOW_PSNR, LOW_TRAIN_PSNR, diagnose
-from pipeline.reporting.data import SceneResults
 from pipeline.reporting.metrics import Metrics
 
 Grade = Literal["good", "weak", "failed"]
@@ -96,9 +95,8 @@ def worst(grades: Collection[str | None]) -> Grade:
     return next((grade for grade in _WORST_FIRST if grade in grades), "good")
 
 
-def verdict(results: SceneResults) -> Verdict:
-    """The verdict on a scene."""
-    metrics, record = results.metrics, results.coverage.record
+def verdict(metrics: Metrics, record: CoverageRecord | None = None) -> Verdict:
+    """The verdict on a scene, and on its coverage if it is given."""
     grade = grade_of(metrics)
     figures = [_placed_figure(metrics), _error_figure(metrics), _seen_figure(record)]
     clauses = [_placed(metrics), _sharpness(metrics), _not_seen(record)]
@@ -129,9 +127,9 @@ def _sharpness(metrics: Metrics) -> str:
             return "sharp at the photographs, blurred or wrong between them"
 
 
-def _not_seen(record: CoverageRecord) -> str:
+def _not_seen(record: CoverageRecord | None) -> str:
     """What the photographs show least, by the first proposed viewpoint."""
-    if not record.viewpoints or record.viewpoints[0].unknown_percent < 50:
+    if record is None or not record.viewpoints or record.viewpoints[0].unknown_percent < 50:
         return ""
     found = _SIDE.match(record.viewpoints[0].description)
     if found is None:
@@ -159,8 +157,8 @@ def _error_figure(metrics: Metrics) -> Figure | None:
     return Figure(f"{error:.2g} %", meaning, render_grade(metrics))
 
 
-def _seen_figure(record: CoverageRecord) -> Figure | None:
-    if record.surface is None:
+def _seen_figure(record: CoverageRecord | None) -> Figure | None:
+    if record is None or record.surface is None:
         return None
     share = record.surface.seen_by.three_or_more
     meaning = "of the visible surface is in three or more photographs"

@@ -310,7 +310,12 @@ class RunDisplay:
         if any(target.parent == self._results for target in targets):
             self._print("\n".join(batch_lines(self._results)))
             return
-        finished = [target.parent for target in targets if target.parent.parent == self._results]
+        published = {file for spec in STAGES.values() for file in spec.publishes}
+        finished = [
+            target.parent
+            for target in targets
+            if target.parent.parent == self._results and target.name in published
+        ]
         for folder in dict.fromkeys(finished):
             with reporting_errors(f"the result of {folder.name}"):
                 self._print("\n".join(result_lines(folder)))

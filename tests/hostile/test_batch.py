@@ -49,7 +49,7 @@ def test_scenes_with_impossible_names(data, capfd):
 def test_a_single_scene_with_an_impossible_name(data, name, capfd):
     photos(data / name, 2)
     assert main(["plan", str(data / name)]) == 2
-    assert "rename the folder" in capfd.readouterr().err
+    assert "--name garden" in capfd.readouterr().err
 
 
 def test_scenes_with_pipes_devices_and_broken_poses(data):
@@ -104,8 +104,9 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     results = data.parent / "results" / "good"
     results.mkdir(parents=True)
     (results / "metrics.json").write_text("{}")
-    job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"), output=["x"])
-    batch = SimpleNamespace(wildcards=SimpleNamespace(), output=[])
+    rule = SimpleNamespace(name="benchmark")
+    job = SimpleNamespace(rule=rule, wildcards=SimpleNamespace(scene="good"), output=["x"])
+    batch = SimpleNamespace(rule=rule, wildcards=SimpleNamespace(), output=[])
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
     project = SnakemakeProject({}, dry_run(dag=dag, scheduler=SimpleNamespace()))
     project.before_jobs()

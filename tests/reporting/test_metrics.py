@@ -116,13 +116,14 @@ def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
 def test_the_result_has_quality_size_poses_time_and_paths(folder):
     line = "PSNR 27.50 dB, SSIM 0.9000, FLIP 0.080, 1,000 Gaussians, 6 of 8 photographs, 2 warnings"
     assert headline(read_metrics(folder)) == line
-    assert finished_line(folder) == f"barn: {line}, 14 s"
+    assert finished_line(folder) == f"barn: Good: {line}, 14 s"
     (folder / "export").mkdir()
     for name in ("scene.spz", "stage.json"):
         (folder / "export" / name).touch()
     lines = result_lines(folder)
-    assert lines[:2] == [f"barn: {line}, 14 s", f"  page     {folder / 'report.html'}"]
-    assert lines[2] == f"  exports  {folder / 'export'}: scene.spz"
+    assert lines[0] == "barn: Good: 6 of 8 photographs placed; sharp where photographed."
+    assert lines[1:3] == [f"  {line}, 14 s", f"  page     {folder / 'report.html'}"]
+    assert lines[3] == f"  exports  {folder / 'export'}: scene.spz"
 
 
 @pytest.mark.parametrize("name", ["report/metrics.json", "sfm/run.json"])

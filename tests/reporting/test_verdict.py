@@ -1,12 +1,10 @@
 """The verdict says what the stages found, and warnings are grouped by cause."""
 
-import dataclasses
-
 import pytest
 
 from pipeline.reporting.names import photograph_names
 from pipeline.reporting.verdict import grouped_warnings, verdict
-from tests.reporting.made import coverage, metrics, report
+from tests.reporting.made import coverage, metrics
 
 OVERFITTING = {"psnr": 20.0, "train_psnr": 33.0}
 CASES = [
@@ -25,7 +23,7 @@ CASES = [
 
 @pytest.mark.parametrize(("changes", "grade", "words"), CASES)
 def test_the_grade_is_the_worst_of_poses_and_renders(changes, grade: str, words: str) -> None:
-    found = verdict(report(metrics=metrics(**changes)))
+    found = verdict(metrics(**changes), coverage().record)
     assert found.grade == grade and words in found.sentence
     # Green only if good: the figure of the error has the grade of the renders.
     assert found.figures[1].grade != "good" or not (changes.keys() & {"psnr"} and grade != "good")
@@ -49,7 +47,7 @@ def test_the_sentence_names_what_was_hardly_seen(description: str, words: str) -
         update={"description": description, "unknown_percent": 70.0}
     )
     record = shown.record.model_copy(update={"viewpoints": (view,)})
-    found = verdict(report(coverage=dataclasses.replace(shown, record=record)))
+    found = verdict(metrics(), record)
     expected = f"what lies {words} was hardly seen" if words else "surroundings were hardly seen"
     assert expected in found.sentence
 

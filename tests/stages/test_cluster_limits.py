@@ -15,7 +15,7 @@ from pipeline.config.schema import Config
 from pipeline.plan import duration
 from pipeline.plan.plan import make_plan
 from pipeline.plan.scan import scan
-from pipeline.runtime import termination
+from pipeline.runtime import job, termination
 from stages import __main__ as main
 from stages.workflow import cluster
 from stages.workflow import project as project_module
@@ -146,7 +146,7 @@ def test_the_cores_of_jobs_of_other_clusters(monkeypatch, variables):
 def test_a_stage_gets_the_threads_and_the_memory_of_its_job(tmp_path, monkeypatch):
     """On a cluster without the memory of the Snakemakes around it."""
     requests = []
-    monkeypatch.setattr(main, "run_stage", lambda request, *_: requests.append(request))
+    monkeypatch.setattr(job, "run_stage", lambda request, *_: requests.append(request))
     arguments = ["init", "--out", str(tmp_path), "--key", "{}", "--threads", "4"]
     monkeypatch.setattr(sys, "argv", ["stages", *arguments, "--memory-mb", "900"])
     monkeypatch.delenv("SLURM_JOB_ID", raising=False)

@@ -44,6 +44,7 @@ def changed(config: Config, path: str) -> Config:
         *_literals(type(section).model_fields[option].annotation),
         0.5,
         1,
+        64,
         "another",
         "gpu:1",
     ]

@@ -145,7 +145,8 @@ def earlier_jobs(folder: Path) -> Sequence[str]:
 
 
 def compile_for_all_nodes() -> None:
-    """Compile the native libraries for every kind of processor that a node may have."""
+    """Compile the native libraries for every kind of processor that a node may have. Errors are
+    left to the jobs."""
     for module in MODULES:
         command = [sys.executable, "-m", module, "--target", "all"]
-        subprocess.run(command, check=False, stdout=sys.stderr)
+        subprocess.run(command, check=False, stdout=subprocess.DEVNULL)

@@ -218,17 +218,18 @@ _DISK_FULL = f"[Errno {errno.ENOSPC}]"
 _NOTHING_TO_DO = "Nothing to be done"
 _SUBMITTED = re.compile(r"Job \S+ has been submitted with SLURM jobid (\d+)")
 _CANCELLED = "Terminating processes on user request"
-# Messages before the first job that have no event, and those after a failed job, whose error the
-# display has shown.
+# Messages before the first job that have no event.
 _ROUTINE = (
     *("Building DAG of jobs", "Assuming unrestricted shared", "Using shell:", "Group jobs:"),
-    "Config file ",
+    *("Config file ", "SLURM run ID"),
 )
-_AFTER_FAILURE = (
+# Warnings that say nothing new: those after a failed job, and those of Slurm's executor where the
+# profile names no account.
+_KNOWN = (
     "Exiting because a job execution failed",
     "WorkflowError:\nAt least one job did not complete successfully",
+    *("No SLURM account given", "No account was given", "Unable to guess SLURM account"),
 )
-
 
 INTERRUPTED = "it was interrupted"
 
@@ -290,7 +291,7 @@ class RunHandler(LogHandlerBase):
         elif text.startswith(_NOTHING_TO_DO):
             self._listener.nothing_to_do(dry_run)
         elif record.levelno >= logging.WARNING:
-            if not text.startswith(_AFTER_FAILURE) and event is not LogEvent.GROUP_ERROR:
+            if not text.startswith(_KNOWN) and event is not LogEvent.GROUP_ERROR:
                 full = _DISK_FULL in text
                 short = "Snakemake cannot write its own files: the disk is full"
                 self._listener.message(short if full else text)

@@ -3,6 +3,7 @@ results have the bits of an undisturbed run on one machine."""
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import tempfile
@@ -210,7 +211,8 @@ def test_an_undisturbed_scene_is_three_jobs(
     undisturbed: Running, reference: Path, cluster: Cluster
 ) -> None:
     """Grouped stages: a scene does not queue for each of its eleven stages."""
-    transcripts.check("cluster", undisturbed.finish(), lines=40)
+    said = re.sub(r"^  submitted .*\n", "", undisturbed.finish(), flags=re.M)
+    transcripts.check("cluster", said, lines=37)
     assert len(undisturbed.submitted()) == 3
     assert Jobs(cluster).of(undisturbed.project, "-t", "all") == undisturbed.submitted()
     assert metrics(undisturbed.project, "tiny") == metrics(reference, "tiny")

@@ -26,9 +26,21 @@ def test_the_first_run(finished: Path) -> None:
 
 def test_a_second_run_and_a_dry_run_of_a_finished_scene(finished: Path, tmp_path: Path) -> None:
     project = copy_run(finished, tmp_path / "project")
-    transcripts.check("second_run", snakemake(project, TARGET, config=TINY).stdout, lines=5)
+    transcripts.check("second_run", snakemake(project, TARGET, config=TINY).stdout, lines=6)
     dry = snakemake(project, "-n", TARGET, config=TINY).stdout
     transcripts.check("dry_run_of_a_finished_scene", dry, lines=2)
+
+
+def test_wrong_words(tmp_path: Path) -> None:
+    project = make_project(tmp_path / "project")
+    noise(project / "data/fog/images", 4)
+    for name, target, config in (
+        ("wrong_target", "results/fog", TINY),
+        ("misspelt_option", "results/fog/metrics.json", {"steps": 100}),
+    ):
+        done = snakemake(project, "-n", target, config=config, check=False)
+        assert done.returncode != 0
+        transcripts.check(name, done.stdout, lines=5)
 
 
 def test_a_stage_that_fails(tmp_path: Path) -> None:

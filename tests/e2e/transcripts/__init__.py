@@ -28,7 +28,12 @@ def masked(text: str) -> str:
     """``text`` without what differs between machines."""
     for pattern, name in _MASKS:
         text = re.sub(pattern, name, text)
-    lines = [line.rstrip() for line in text.splitlines() if not _PROGRESS.match(line)]
+    # Columns are as wide as their values.
+    lines = [
+        re.sub(r"(?<=\S) {2,}", "  ", line).rstrip()
+        for line in text.splitlines()
+        if not _PROGRESS.match(line)
+    ]
     ended = [line for line in lines if line.endswith("<time>") and line.split()[0] in _PARALLEL]
     ordered = iter(sorted(ended))
     return "\n".join(next(ordered) if line in ended else line for line in lines) + "\n"

@@ -87,7 +87,7 @@ test: setup $(VENV)/dev $(VENV)/gpu
 
 # Half of the tests in a tenth of the time, for each change: no scene is reconstructed, no kernel is
 # compared with its reference, nothing is fuzzed.
-FAST_TESTS := $(addprefix tests/,api command config geometry io plan runtime scene splats metrics photos reporting \
+FAST_TESTS := $(addprefix tests/,api config geometry io plan runtime scene splats metrics photos reporting \
   command training/density training/losses training/optimisers test_layers.py test_schemas.py \
   test_reference_pages.py test_tools.py) --ignore=tests/io/clouds --ignore=tests/reporting/test_viewer.py \
   --ignore=tests/reporting/test_barriers.py

@@ -115,6 +115,8 @@ def test_an_interruption_ends_the_pipeline_and_its_jobs(
         env=os.environ | {"PYTHONPATH": str(Path(splatmake.__file__).parents[1])},
         stderr=subprocess.PIPE,
         text=True,
+        # As in a terminal, also where the tests run in the background of a shell.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     killer = threading.Timer(120, user.kill)
     killer.start()

@@ -153,7 +153,7 @@ def test_a_file_with_another_digest_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"m\.png: has changed since the scene was inspected"):
         load_view(view)
     Image.fromarray(gradient()[::-1]).save(tmp_path / "a.png")
-    with pytest.raises(UserError, match=r"a\.png: has changed .*\n.*run the same snakemake"):
+    with pytest.raises(UserError, match=r"a\.png: has changed .*\n.*run the same command"):
         load_view(view)
     np.save(tmp_path / "d.npy", np.zeros((24, 36)))
     with pytest.raises(UserError, match=r"d\.npy: has changed"):

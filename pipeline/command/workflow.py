@@ -17,7 +17,7 @@ from pipeline.config.config_file import check_config_file
 from pipeline.config.presets import PRESETS
 from pipeline.config.runs import name_fault
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.layout import COMMAND, PACKAGES, WORKFLOW, install_extra
+from pipeline.runtime.layout import CALLER, COMMAND, PACKAGES, WORKFLOW, install_extra
 from pipeline.runtime.suggest import did_you_mean, nearest, nearest_path
 
 _SLURM = "snakemake_executor_plugin_slurm"
@@ -88,7 +88,7 @@ def _add_running(add: Callable[..., object]) -> None:
         "current folder)"
     )
     add("--out", type=Path, metavar="DIR", help=text)
-    add("--preset", choices=tuple(PRESETS), help="(default: the configuration file's)")
+    add("--preset", choices=tuple(PRESETS), help="(default: balanced, or the configuration file's)")
     text = "processor cores to use (default: all)"
     add("-c", "--cores", type=types.cores, default="all", metavar="N", help=text)
     add(
@@ -282,7 +282,7 @@ def _config_files(options: Sequence[str]) -> list[Path]:
 def replace_process(command: list[str]) -> NoReturn:
     """Replace this process by Snakemake, which then receives signals and sets the exit code."""
     # Without this, Python looks for packages in the current folder first, which is the user's.
-    environment = os.environ | {"PYTHONSAFEPATH": "1"}
+    environment = os.environ | {"PYTHONSAFEPATH": "1", CALLER: os.getcwd()}
     sys.stdout.flush()
     sys.stderr.flush()
     os.execve(command[0], list(command), environment)

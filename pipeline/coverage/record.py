@@ -142,6 +142,4 @@ class CoverageRecord(JsonFile, JsonObject):
         """What was found, in a few words for the terminal."""
         if self.surface is None:
             return self.reason
-        once = f"{self.surface.seen_by.one:.0%} of the surface in one photograph only; "
-        places = f"{counted(len(self.viewpoints), 'place')} to photograph next"
-        return places if once.startswith("0%") else once + places
+        return f"{counted(len(self.viewpoints), 'place')} to photograph next"

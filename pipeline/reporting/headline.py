@@ -11,7 +11,8 @@ from typing import Any
 from pipeline.config.runs import Run
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs
 from pipeline.reporting.verdict import verdict
-from pipeline.runtime.layout import COMMAND
+from pipeline.runtime.layout import COMMAND, as_called
+from pipeline.runtime.record import RECORDS
 from pipeline.runtime.text import counted, duration, shortened
 
 
@@ -52,16 +53,16 @@ def result_lines(folder: Path) -> list[str]:
     Raises:
         UserError: A record of the run is missing or damaged.
     """
-    exported = sorted(file.name for file in (folder / "export").glob("[!.]*.*"))
-    files = [name for name in exported if name not in ("stage.json", "run.json")]
+    exported = sorted(path.name for path in (folder / "export").glob("[!.]*"))
+    files = [name for name in exported if name not in (*RECORDS, "frame.json", "path.json")]
     metrics = read_metrics(folder)
     found = verdict(metrics)
     return [
         f"{metrics.scene}: {found.title}: {found.sentence}",
         f"  {_with_time(metrics, folder)}",
-        f"  page     {folder / 'report.html'}",
-        *([f"  exports  {folder / 'export'}: {', '.join(files)}"] if files else []),
-        f"  next     {COMMAND} view {shlex.quote(str(folder))}",
+        f"  page     {as_called(folder / 'report.html')}",
+        *([f"  exports  {as_called(folder / 'export')}: {', '.join(files)}"] if files else []),
+        f"  next     {COMMAND} view {shlex.quote(str(as_called(folder)))}",
     ]
 
 
@@ -81,7 +82,9 @@ def batch_lines(results: Path) -> list[str]:
     cells: list[tuple[str, ...]] = [("run", "PSNR", "SSIM", "Gaussians", "time", "")]
     cells += [_cells(row, seeded) for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [_aligned(line, widths) for line in cells] + [f"  page  {results / 'index.html'}"]
+    return [_aligned(line, widths) for line in cells] + [
+        f"  page  {as_called(results / 'index.html')}"
+    ]
 
 
 def _cells(row: dict[str, Any], seeded: bool) -> tuple[str, ...]:

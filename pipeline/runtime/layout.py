@@ -25,8 +25,17 @@ STAGE_OUTPUT = "SPLATMAKE_STAGE_OUTPUT"
 """Environment variable: "log" if stages write to their logs alone, because Snakemake shows what
 they find."""
 
+CALLER = "SPLATMAKE_CALLER"
+"""Environment variable: the folder in which ``splatmake`` was called, which may run in another."""
+
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
 """Native libraries in wheels."""
+
+
+def as_called(path: Path) -> Path:
+    """A path as it is seen from the folder in which ``splatmake`` was called."""
+    caller = os.environ.get(CALLER)
+    return Path(os.path.relpath(path, caller)) if caller else path
 
 
 def install_extra(name: str) -> str:

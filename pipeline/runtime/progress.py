@@ -66,7 +66,9 @@ def write_progress_to(path: Path | None) -> None:
 def progress_text(state: ProgressState) -> str:
     """A line on the state of some work: its position, the time left, its note."""
     at = _position(state.unit, state.done, state.total)
-    left = f", {duration(round(state.seconds_left))} left" if state.done else ""
+    # The first units and the last second say little about the rest.
+    is_known = state.done >= max(2, 0.05 * state.total) and state.seconds_left >= 1
+    left = f", {duration(round(state.seconds_left))} left" if is_known else ""
     return f"{state.label}: {at}{left}{f', {state.note}' if state.note else ''}"
 
 

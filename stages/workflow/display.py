@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import signal
 import sys
 import threading
 import time
@@ -178,7 +179,7 @@ class RunDisplay:
             text = describe(plan.model_copy(update={"scene": ""}), full=full, finished=done)
             first = seen.setdefault(text, run)
             if first != run:
-                self._print(f"{run}: as {first}")
+                self._print(f"{run}: the same plan as {first}")
             elif self._batch:
                 self._print(describe(plan).splitlines()[0])
             else:
@@ -190,12 +191,16 @@ class RunDisplay:
     def poll(self) -> None:
         """Show what has changed since the last call."""
         with self._lock:
-            for job in [job for job in self._pending if job.is_new(job.record)]:
+            ended = [job for job in self._pending if job.is_new(job.record)]
+            if ended:
+                self._screen.show([])
+            for job in ended:
                 self._pending.remove(job)
                 self._done += 1
                 self._show_finished(job)
             lines = self._progress_lines()
-            self._screen.show(lines)
+            if not self._was_cancelled:
+                self._screen.show(lines)
             now = time.time()
             if not self._screen.live and lines and now - self._last_line >= _LINE_SECONDS:
                 self._last_line = now
@@ -228,8 +233,11 @@ class RunDisplay:
                 self._screen.print(f"--- {log}\n{log.read_text().rstrip()}\n---")
 
     def cancelled(self) -> None:
-        """Remember that the user stopped the run."""
+        """Say that the run is being stopped. Jobs save their state; Snakemake itself would end with
+        a traceback after a second Ctrl-C, which only they receive from then on."""
         self._was_cancelled = True
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._screen.show(["stopping: the running stages save their state"])
 
     def message(self, text: str) -> None:
         """Show a message."""
@@ -330,7 +338,9 @@ class RunDisplay:
 def show_run(workflow: Any) -> RunDisplay:
     """Show the run of a ``workflow`` of Snakemake in the program's own words."""
     flow = Flow(workflow)
-    display = RunDisplay(flow, Screen(sys.stderr), RESULTS, time.time())
+    # A plan is what a dry run is for: it can be piped.
+    stream = sys.stdout if flow.is_dry_run else sys.stderr
+    display = RunDisplay(flow, Screen(stream), RESULTS, time.time())
     if flow.is_shown:
         listen(workflow, display)
     return display

@@ -20,6 +20,8 @@ from snakemake.persistence import PersistenceBase
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
 
+from pipeline.runtime.layout import as_called
+
 # --- the run ------------------------------------------------------------------------------------
 
 
@@ -64,6 +66,11 @@ class Flow:
     def is_verbose(self) -> bool:
         """The value of ``--verbose``."""
         return bool(self._workflow.output_settings.verbose)
+
+    @property
+    def is_dry_run(self) -> bool:
+        """Whether ``--dry-run`` is given."""
+        return bool(self._workflow.output_settings.dryrun)
 
     @property
     def is_quiet(self) -> bool:
@@ -319,7 +326,7 @@ def listen(workflow: Any, listener: Listener) -> None:
 def log_file() -> str:
     """The file with Snakemake's own messages; empty without one."""
     files = (getattr(handler, "baseFilename", "") for handler in logger.handlers)
-    return next((os.path.relpath(file) for file in files if file), "")
+    return next((str(as_called(Path(os.path.relpath(file)))) for file in files if file), "")
 
 
 def _command_end(record: logging.LogRecord) -> str | None:

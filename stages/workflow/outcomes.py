@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.runs import Run
+from pipeline.plan.record import read_plan
+from pipeline.runtime.errors import UserError
 
 
 def outcome(
@@ -42,6 +44,15 @@ def error_in(log: Path, started: float) -> str:
         return ""
     _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
     return message.partition(": ")[2].rstrip() if found else ""
+
+
+def was_made(folder: Path, stage: str) -> bool:
+    """Whether the last plan of a run has the stage with this folder, and the run has finished."""
+    try:
+        runs = read_plan(folder.parent).runs(stage)
+    except UserError:
+        return False
+    return runs and (folder.parent / "metrics.json").is_file()
 
 
 def interrupted_at(log: Path, started: float) -> str | None:

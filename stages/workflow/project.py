@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project, scene_config
@@ -49,10 +49,10 @@ from stages.workflow.cluster import (
     wait_for_earlier_jobs,
 )
 from stages.workflow.display import RunDisplay, show_run
-from stages.workflow.failures import reporting_errors
+from stages.workflow.failures import exit_with, reporting_errors
 from stages.workflow.folders import RESULTS, check_working_directory, check_writable
 from stages.workflow.internals import Flow, use_locks_of_runs
-from stages.workflow.outcomes import failed_job, outcome
+from stages.workflow.outcomes import failed_job, outcome, was_made
 from stages.workflow.registry import STAGES
 
 # Written when runs of a batch failed. From then on it is an input of the tables, so that these are
@@ -65,7 +65,7 @@ def check_config(path: str) -> None:
     try:
         check_config_file(Path(path))
     except UserError as error:
-        _exit(error)
+        exit_with(error)
 
 
 # Factor of the memory of a job that is tried again.
@@ -98,7 +98,7 @@ class SnakemakeProject:
             use_locks_of_runs()
             self._project, named = load_project(self._raw)
         except UserError as error:
-            _exit(error)
+            exit_with(error)
         self._display = display or show_run(workflow)
         self._root = self._display.data_root = Path(self._project.data_root)
         for name in named:
@@ -164,8 +164,9 @@ class SnakemakeProject:
         folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
         if lost := missing_output(folder):
             self._flow.force(folder / STAGE)
-            # The outputs of an unfinished run are not lost: they have not been made yet.
-            if folder not in self._lost and (folder.parent / "metrics.json").is_file():
+            # What has no record has not been made yet, or is being made again: Snakemake deletes
+            # the record first.
+            if folder not in self._lost and lost.name != STAGE and was_made(folder, spec.name):
                 self._lost.add(folder)
                 print(f"{lost} is missing: {folder.name} runs again", file=sys.stderr)
             return
@@ -268,7 +269,7 @@ class SnakemakeProject:
                 check_not_locked(RESULTS / name)
             return self._make_plan(name)
         except UserError as error:
-            _exit(error)
+            exit_with(error)
 
     def _scan_and_plan(self, name: str) -> Plan:
         self._check_results(name)
@@ -331,7 +332,7 @@ class SnakemakeProject:
             folders = [path for path in self._root.glob("*") if os.path.isdir(path)]
         except OSError as error:
             fix = "give yourself the permission to read it, or set data_root to another folder"
-            _exit(UserError(f"cannot be read: {error.strerror}", file=self._root, fix=fix))
+            exit_with(UserError(f"cannot be read: {error.strerror}", file=self._root, fix=fix))
         return sorted(path.name for path in folders if path.name[0] not in "._")
 
     @cached_property
@@ -349,7 +350,7 @@ class SnakemakeProject:
             print(f"left out: {message}", file=sys.stderr)
         if len(left_out) == len(runs):
             fix = "set data_root to the folder whose subfolders are scenes"
-            _exit(UserError("expected scene folders, found none", file=self._root, fix=fix))
+            exit_with(UserError("expected scene folders, found none", file=self._root, fix=fix))
         return runs, left_out
 
     def every_run(self, wildcards: Any) -> list[str]:
@@ -390,10 +391,10 @@ class SnakemakeProject:
                 check_writable(folder)
                 lock_run(folder)
             except UserError as error:
-                _exit(error)
+                exit_with(error)
             except OSError as error:
                 error.filename = error.filename or str(folder)
-                _exit(as_user_error(error) or UserError(f"{error}", file=folder))
+                exit_with(as_user_error(error) or UserError(f"{error}", file=folder))
         self._flow.unlimit_rate()
         if self._flow.submits_jobs:
             self._flow.watch(needed)
@@ -439,11 +440,3 @@ class SnakemakeProject:
 def _sources(spec: StageSpec, plan: Plan, name: str) -> dict[str, Path]:
     """Role of the stage's input -> its folder."""
     return {role: RESULTS / name / source for role, source in input_folders(spec, plan).items()}
-
-
-def _exit(error: UserError) -> NoReturn:
-    """End Snakemake with the error's warnings and message, without a traceback."""
-    for warning in error.warnings:
-        print(f"  warning: {warning}", file=sys.stderr)
-    print(f"error: {error}", file=sys.stderr, flush=True)
-    raise SystemExit(2) from None

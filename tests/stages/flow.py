@@ -17,6 +17,8 @@ def dry_run(**facts: Any) -> SimpleNamespace:
         "executor_plugin": None,
         "non_local_exec": False,
         "remote_exec": False,
-        "output_settings": SimpleNamespace(verbose=False, quiet=None, show_failed_logs=False),
+        "output_settings": SimpleNamespace(
+            verbose=False, quiet=None, show_failed_logs=False, dryrun=False
+        ),
     }
     return SimpleNamespace(**usual | facts)

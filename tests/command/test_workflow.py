@@ -63,6 +63,7 @@ def test_profiles_of_the_program_have_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(workflow, "_SLURM", "json")  # As if the plugin were installed.
     main(["run", str(tmp_path), "--workflow-profile", "slurm"])
     command = started.pop()
     chosen = Path(command[command.index("--workflow-profile") + 1])

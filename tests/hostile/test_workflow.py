@@ -84,7 +84,7 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 200
-    while not progress.exists():
+    while not progress.exists() or '"training"' not in progress.read_text():
         assert process.poll() is None, "snakemake ended before the training"
         assert time.monotonic() < deadline
         time.sleep(0.05)

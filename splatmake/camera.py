@@ -51,8 +51,7 @@ class Camera:
         if not (np.isfinite(numbers).all() and self.fx > 0 < self.fy):
             what = f"expected focal lengths above 0 and a principal point, found {numbers}"
             raise UserError(what, fix="give fx, fy, cx and cy in pixels")
-        rotation = pose[:3, :3]
-        if pose.shape != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
+        if not _is_pose(pose):
             raise UserError(
                 f"world_to_camera: expected a rotation and a translation in a 4 x 4 matrix, found "
                 f"{pose.tolist()}",
@@ -143,6 +142,15 @@ class Camera:
         """A view of this camera, without photograph."""
         sizes = self.width, self.height, self.fx, self.fy, self.cx, self.cy
         return View("", "", None, *sizes, self.world_to_camera, is_test=False)
+
+
+def _is_pose(matrix: NDArray[np.float64]) -> bool:
+    """Whether a matrix is a rotation, which does not mirror, and a translation."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return False
+    rotation = matrix[:3, :3]
+    is_orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+    return bool(is_orthogonal and np.linalg.det(rotation) > 0)
 
 
 def _unit(vector: NDArray[np.float64], least: float = 0.0) -> NDArray[np.float64] | None:

@@ -15,7 +15,7 @@ from pipeline.runtime.record import RECORDS
 
 PAGE, ENTRY, EXPORTS = "report.html", "index.html", "export"
 
-# In the page's head, by which a published folder is recognised.
+# The line in the page's head by which a published folder is recognised.
 MARK = '<meta name="generator" content="splatmake">'
 
 _LINK = re.compile(rf'href="({EXPORTS}/[^"/]+)"')
@@ -30,6 +30,8 @@ _LABELS = {
     "points.ply": "Sparse points (PLY)",
     "dense_points.ply": "Dense points (PLY)",
     "transforms.json": "Cameras (transforms.json)",
+    "video.mp4": "Video",
+    "path.json": "Camera path of the video (JSON)",
 }
 
 

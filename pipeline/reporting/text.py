@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pipeline.runtime import text
+
 MISSING = "n/a"
 
 
@@ -21,15 +23,10 @@ def count(value: float | None) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """0.42 s, 7.1 s, 3 min 20 s, 2 h 05 min."""
+    """As ``pipeline.runtime.text.duration``, or n/a for None and values that are not finite."""
     if seconds is None or not math.isfinite(seconds):
         return MISSING
-    if seconds < 60:
-        return f"{seconds:.2f} s" if seconds < 1 else f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
+    return text.duration(seconds)
 
 
 def plain(value: Any) -> str:

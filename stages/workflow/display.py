@@ -148,10 +148,12 @@ class RunDisplay:
     def nothing_to_do(self, dry_run: bool) -> None:
         """Show the results of runs that have finished before."""
         if dry_run:
-            asked = [Path(target).relative_to(self._results) for target in self._flow.targets()]
-            named = dict.fromkeys(path.parts[0] for path in asked)
-            for name in named:
+            places = (Path(target).parts for target in self._flow.targets())
+            runs = dict.fromkeys(parts[1] for parts in places if len(parts) > 2)
+            for name in runs:
                 self._print(f"{name}: up to date; its plan is {self._results / name / 'plan.json'}")
+            if not runs:
+                self._print("the batch is up to date")
         else:
             self._show_results()
 
@@ -236,7 +238,8 @@ class RunDisplay:
         """Say that the run is being stopped. Jobs save their state; Snakemake itself would end with
         a traceback after a second Ctrl-C, which only they receive from then on."""
         self._was_cancelled = True
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with contextlib.suppress(ValueError):  # Not in the main thread.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._screen.show(["stopping: the running stages save their state"])
 
     def message(self, text: str) -> None:

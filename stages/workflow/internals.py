@@ -291,8 +291,12 @@ class RunHandler(LogHandlerBase):
         elif event is LogEvent.JOB_FINISHED:
             self._listener.poll()
         elif event is LogEvent.JOB_ERROR:
-            for log in record.__dict__["log"]:
+            logs = record.__dict__["log"]
+            for log in logs:
                 self._listener.job_failed(Path(log), self._end)
+            if not logs:
+                rule = record.__dict__["rule_name"]
+                self._listener.message(f"error in {rule}: {self._end or 'it failed'}")
         elif (end := _command_end(record)) is not None:
             self._end = end
         elif text.startswith(_NOTHING_TO_DO):

@@ -67,7 +67,12 @@ def test_what_is_no_camera_is_one_error(wrong: dict[str, Any], said: str) -> Non
         Camera.look_at(**(GOOD | wrong))
 
 
-@pytest.mark.parametrize("pose", [2 * np.eye(4), np.eye(3), np.full((4, 4), np.nan)])
+MIRRORED = np.diag([-1.0, 1.0, 1.0, 1.0])
+FAR = np.eye(4)
+FAR[0, 3] = np.inf
+
+
+@pytest.mark.parametrize("pose", [2 * np.eye(4), np.eye(3), np.full((4, 4), np.nan), MIRRORED, FAR])
 def test_a_pose_is_a_rotation_and_a_translation(pose: np.ndarray) -> None:
     with pytest.raises(UserError, match="world_to_camera: expected a rotation"):
         Camera(8, 6, 5.0, 5.0, 4.0, 3.0, pose)

@@ -90,6 +90,7 @@ def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path
     assert rules_run(done) == {"benchmark"}
     assert {row["status"] for row in rows(project).values()} == {"ok", "left out"}
     assert not rules_run(snakemake(project, TABLE, config=CONFIG))
+    assert "the batch is up to date" in snakemake(project, "-n", TABLE, config=CONFIG).stdout
 
     # A further configuration runs alone.
     more = CONFIG | {"configs": CONFIG["configs"] | {"sh1": {"train": {"sh_degree": 1}}}}

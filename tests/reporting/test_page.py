@@ -64,7 +64,7 @@ def test_every_number_is_on_the_page() -> None:
     shown = [
         *("27.35", "0.8765", "0.1235", "123,456", "47 / 49", "0.457", "0.0321", "0.00456"),
         *("21.99", "0.7123", "0.2345", "33.46", "0.9321", "0.0456"),
-        *("12.5 s", "23.4 s", "345 MB", "14.5 s", "347 MB", "27.0 s", "2.13.0", "17"),
+        *("12 s", "23 s", "345 MB", "14 s", "347 MB", "27 s", "2.13.0", "17"),
         *("17.89 dB", "23.45 dB", "0.1234", "7,003", "640x480", "every 8th", "a window"),
         *("because of decode", "skipped", "incremental mapper: 49 images", "300 sparse points"),
         *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
@@ -271,4 +271,4 @@ def test_blocks_are_on_their_map_and_in_their_table() -> None:
     assert all(float(box["width"] or 0) > 0 and float(box["height"] or 0) > 0 for box in boxes)
     cameras = [attrs for _, attrs in page.tags if attrs.get("class") == "camera"]
     assert len(cameras) == sum(not view.is_test for view in ring())
-    assert "1,234 21.50 dB 1 min 01 s 345 MB" in page.all_text()
+    assert "1,234 21.50 dB 1 min 1 s 345 MB" in page.all_text()

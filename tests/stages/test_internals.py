@@ -286,6 +286,15 @@ def test_a_failed_job_is_told_with_its_log_and_the_end_of_its_command(
     assert said in how and len(how) < 200
 
 
+def test_a_failed_job_without_a_log_is_told(told: Told) -> None:
+    """The tables of a batch: their job may be killed."""
+    rule_exception("died with <Signals.SIGKILL: 9>.")
+    extra = {"rule_name": "benchmark", "log": [], "shellcmd": COMMAND}
+    logger.error("Error in rule benchmark", extra={"event": LogEvent.JOB_ERROR, **extra})
+    ((name, text),) = told.calls
+    assert name == "message" and text.startswith("error in benchmark: its command died")
+
+
 def test_errors_and_warnings_of_snakemake_are_told_and_its_routine_is_not(told: Told) -> None:
     for text in ("Building DAG of jobs...", "Select jobs to execute..."):
         logger.info(text)

@@ -17,9 +17,6 @@ IN NO EVENT SHALL THE AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMA
 LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN
 CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 */
-// Interactive view of the trained scene. ../space.py writes the page's elements and data for it;
-// README.md describes how viewer.min.js is built from this file. There are two coordinate frames:
-// the world, and the page's frame, in which y is up and the scene is in the unit box around the
 // Interactive view of the trained scene. ../../space.py writes the page's elements and data for it;
 // ../README.md describes how viewer.min.js is built from these files. There are two coordinate
 // frames: the world, and the page's frame, in which y is up and the scene is in the unit box around

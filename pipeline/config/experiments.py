@@ -25,6 +25,7 @@ from pipeline.config.section import (
 )
 
 PartOfRun = Annotated[float, Field(ge=0, lt=1), Unit("share of the steps")]
+PartOfGaussians = Annotated[float, Field(ge=0, lt=1), Unit("share of the Gaussians")]
 Factor = Annotated[float, Field(gt=0, le=MAX_FACTOR), Unit("factor")]
 
 
@@ -190,6 +191,11 @@ class TrainExperiments(Section):
         None,
         description="Factor of all learning rates. null: sqrt(30000 / steps), between 1 and 4, "
         "or less than 4 if fewer than half of the views see a Gaussian (3DGS: 1).",
+    )
+    dropout: PartOfGaussians | None = Field(
+        None,
+        description="Share of the Gaussians that is not drawn in a step, at the end of the run; it "
+        "rises from 0. null: 0.2 for few training views, else 0 (3DGS: 0).",
     )
     learning_rate_decay_start: PartOfRun = Field(
         0.7,

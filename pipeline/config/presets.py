@@ -51,6 +51,7 @@ PRESETS: dict[str, dict[str, Any]] = {
                 "squared_error_loss_weight": 0.0,
                 "alpha_loss_weight": 0.0,
                 "clamp_color_gradient": True,
+                "dropout": 0.0,
                 "adam_beta1": 0.9,
                 "adam_epsilon": 0.0,
                 "means_learning_rate_unit": "camera_extent",

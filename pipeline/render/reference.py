@@ -27,6 +27,7 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 QUAT_NORM2_MIN = 1e-8
 COMPENSATION_MIN = 2.5e-5
+MIN_DEPTH_SIGMAS = 2.0
 COVARIANCE_MAX = 1e30
 SH_MAX = 1e6
 
@@ -107,8 +108,9 @@ def project(
     a low-pass filter; ``antialias`` preserves the energy by scaling the opacity with
     sqrt(det Sigma' / det(Sigma' + 0.3 I)) (Yu et al. 2024, "Mip-Splatting", eq. 9).
 
-    A Gaussian is visible if z > near, its opacity is at least 1/255, and the bounding box of the
-    ellipse {alpha >= 1/255} contains a pixel centre.
+    A Gaussian is visible if z > near, its ellipsoid of two standard deviations is in front of the
+    camera (z > 2 sigma_z: the perspective image of others is no ellipse), its opacity is at least
+    1/255, and the bounding box of the ellipse {alpha >= 1/255} contains a pixel centre.
     """
     dtype = means.dtype
     pose = camera.world_to_camera.to(dtype)
@@ -150,7 +152,9 @@ def project(
         size = torch.tensor([camera.width, camera.height], dtype=dtype)
         first = (means2d - extent - 0.5).ceil().clamp(min=0)
         last = torch.minimum((means2d + extent - 0.5).floor(), size - 1)
-        visible = sound & (reach2 > 0) & (first <= last).all(-1)
+        sigma_z = (pose[2, :3] @ axes).norm(dim=-1)
+        visible = sound & (z > MIN_DEPTH_SIGMAS * sigma_z)
+        visible &= (reach2 > 0) & (first <= last).all(-1)
         good_color = (active.abs() <= SH_MAX).all(-1).all(-1)
         dropped = int((~ok).sum() + (~sound).sum() + (visible & ~good_color).sum())
         visible &= good_color

@@ -21,9 +21,9 @@ def test_gradient_of_the_projection(antialias: bool) -> None:
     scene = doubles()
     # Two Gaussians outside the image: the clamp of the Jacobian is tested, too.
     with torch.no_grad():
-        scene[0][0] = torch.tensor([6.0, 0.1, 4.0])
-        scene[0][1] = torch.tensor([0.1, -6.0, 4.0])
-        scene[1][:2] = 1.0
+        scene[0][0] = torch.tensor([3.5, 0.1, 4.5])
+        scene[0][1] = torch.tensor([0.1, -5.0, 4.5])
+        scene[1][:2] = 0.2
 
     def outputs(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         p = reference.project(*inputs, scene[4].detach(), CAMERA, options)

@@ -16,7 +16,7 @@ CONSTANTS = Path(__file__).parents[1] / "cpu/csrc/constants.h"
 # The constants of the method and of the layout that the kernels share with the C++ ones.
 SHARED = (
     "kDilation", "kAlphaMin", "kLog2AlphaMin", "kAlphaMax", "kTransmittanceMin", "kQuatNorm2Min",
-    "kCompensationMin", "kShMax", "kTile",
+    "kCompensationMin", "kMinDepthSigmas", "kShMax", "kTile",
 )  # fmt: skip
 
 _BINDING = re.compile(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pipeline.render import Backend, Gradients
+from pipeline.training.dropout import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
@@ -30,7 +33,11 @@ class OperatorStep(StepEngine):
         state, view = self.state, step.view
         gaussians, appearance = state.gaussians, state.appearance
         shown = None if appearance is None else appearance.show(gaussians, view.index)
-        rendered = self.backend.forward(*gaussians.parameters(), view.camera, step.options)
+        opacities = self._thinned(step)
+        drawn = gaussians
+        if opacities is not None:
+            drawn = replace(gaussians, opacity_logits=opacities.logits)
+        rendered = self.backend.forward(*drawn.parameters(), view.camera, step.options)
         color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
         self.require_finite(color.loss, view)
         others = summed_gradients(self.losses, rendered, view, state.step)
@@ -43,12 +50,20 @@ class OperatorStep(StepEngine):
             camera=state.cameras.enabled,
             sh_adam=state.adam.harmonics(step.adam),
         )
+        if opacities is not None:
+            gradients.opacity_logits.mul_(opacities.derivative)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
         self._update_cameras(step, gradients)
         state.density.before_step(gaussians, rendered, gradients)
         state.adam.step(gaussians, gradients, step.adam, self.run.threads)
         return StepResult(color.loss, color.psnr, rendered.num_visible, rendered.num_dropped)
+
+    def _thinned(self, step: Step) -> ThinnedOpacities | None:
+        """The opacities of the step; None without drop-out."""
+        if not step.dropped_share:
+            return None
+        return thinned(self.state.gaussians.opacity_logits, step.dropped_share, self.state.rng)
 
     def fetch(self) -> None:
         """The tensors of the state are always current."""

@@ -50,6 +50,7 @@ class Schedule:
         coarse_steps: The number of steps at reduced resolution: the first half at 1/4, the others
             at 1/2.
         seen_share: The mean share of the views that see a Gaussian.
+        dropout: The share of the Gaussians that is not drawn in the last step.
     """
 
     options: TrainOptions
@@ -57,9 +58,10 @@ class Schedule:
     sh_interval: int
     coarse_steps: int
     seen_share: float
+    dropout: float = 0.0
 
     @staticmethod
-    def of(options: TrainOptions, seen_share: float = 1.0) -> Schedule:
+    def of(options: TrainOptions, seen_share: float = 1.0, dropout: float = 0.0) -> Schedule:
         """The schedule of ``options.steps`` steps, or of ``options.budget_minutes``."""
         minutes, experiments = options.budget_minutes, options.experiments
         steps = schedule_length(options)
@@ -74,6 +76,7 @@ class Schedule:
             sh_interval=max(1, shrunk(experiments.sh_degree_interval, steps)),
             coarse_steps=int(coarse * steps),
             seen_share=seen_share,
+            dropout=dropout,
         )
 
     def resolution_factor(self, step: int) -> int:
@@ -84,6 +87,10 @@ class Schedule:
 
     def sh_degree_at(self, step: int) -> int:
         return min(self.options.sh_degree, step // self.sh_interval)
+
+    def dropped_share_at(self, step: int) -> float:
+        """The share of the Gaussians that is not drawn in a step: it rises linearly from 0."""
+        return self.dropout * step / self.steps
 
     def budget_at(self, step: int) -> int:
         """Upper limit of the number of Gaussians: lower at reduced resolution, which has fewer

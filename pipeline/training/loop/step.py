@@ -28,6 +28,7 @@ class Step:
             the steps uses (``Schedule.camera_rate``), as a function of that share.
         measures_psnr: Whether the PSNR of the render is measured, which takes a pass over the
             image.
+        dropped_share: The share of the Gaussians that is not drawn (``training.dropout``).
     """
 
     view: StepView
@@ -35,6 +36,7 @@ class Step:
     adam: AdamStep
     camera_rate: Callable[[float], float]
     measures_psnr: bool
+    dropped_share: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pipeline.training.data.targets import usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.density.strategy import DensityStep
+from pipeline.training.dropout import dropout_of
 from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.operator_step import OperatorStep
@@ -40,7 +41,8 @@ class Trainer:
         self.floaters = floater_removal(scene, run)
         self.rate_unit = learning_rate_unit(scene.inputs, run.options)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, run.steps // CURVE_RECORDS))
-        self.schedule = Schedule.of(run.options, scene.inputs.seen_share)
+        share = dropout_of(run, len(scene.views))
+        self.schedule = Schedule.of(run.options, scene.inputs.seen_share, share)
         self.clock = Clock(run.steps, run.options.budget_minutes, run.span)
 
     def step(self) -> None:
@@ -65,6 +67,7 @@ class Trainer:
                     state.clock, max(1.0, run_length * share)
                 ),
                 measures_psnr=(state.step - 1) % self.psnr_interval == 0,
+                dropped_share=self.schedule.dropped_share_at(state.clock),
             )
         )
         self.count(result)
@@ -204,8 +207,9 @@ def make_engine(
     scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
 ) -> StepEngine:
     """Steps on the backend's device, or by its operators if that is the CPU or if the strategy
-    needs more in a step than devices do: losses of its own or noise."""
-    training = None if state.density.statistics is None else backend.resident()
+    needs more in a step than devices do: losses of its own, noise or drop-out."""
+    operators = state.density.statistics is None or dropout_of(run, len(scene.views)) > 0
+    training = None if operators else backend.resident()
     if training is None:
         return OperatorStep(scene, state, run, backend)
     return DeviceStep(scene, state, run, backend, training)

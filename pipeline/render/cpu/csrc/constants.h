@@ -29,6 +29,11 @@ constexpr float kTransmittanceMin = 1e-4f;
 // Squared norm below which a quaternion is invalid: its direction is lost in float32.
 constexpr double kQuatNorm2Min = 1e-8;
 
+// A Gaussian is drawn if its camera z is more than this many of its standard deviations along z, so
+// that the ellipsoid of these is in front of the camera. The perspective image of others is no
+// ellipse, and the linearised one can cover the view. benchmarks/projection.py measures the error.
+constexpr double kMinDepthSigmas = 2.0;
+
 // Lower bound of det(undilated) / det(dilated) in Mip-Splatting's square root, whose slope is
 // infinite at 0. As in 3DGS, opacity is scaled by at least 0.005.
 constexpr double kCompensationMin = 2.5e-5;

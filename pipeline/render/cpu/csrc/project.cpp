@@ -116,11 +116,16 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
     // The centre may be anywhere, but the depth is stored in float32.
     const LaneMask sound = (p.det > 0.0) & (p.xx < kCovarianceMax) & (p.yy < kCovarianceMax) &
                            (p.x - p.x == 0.0) & (p.y - p.y == 0.0) & (p.cam.z < 1e38);
+    // The standard deviations along the axes, times the camera's z axis
+    const Vec3 forward = row(view.rotation, 2);
+    const Vec3 along_z = forward.x * p.m[0] + forward.y * p.m[1] + forward.z * p.m[2];
+    const LaneMask ellipse =
+        p.cam.z * p.cam.z > (kMinDepthSigmas * kMinDepthSigmas) * dot(along_z, along_z);
     const PixelRange across = pixel_range(p.x, extent_x, view.width);
     const PixelRange down = pixel_range(p.y, extent_y, view.height);
     const uint32_t all = (1u << kProjectLanes) - 1;
     s.dropped = (~bits(usable) | (bits(in_front) & ~bits(sound))) & all;
-    s.drawn = bits(usable & in_front & sound & (reach > 0.0) & (across.first <= across.last) &
+    s.drawn = bits(usable & in_front & sound & ellipse & (reach > 0.0) & (across.first <= across.last) &
                    (down.first <= down.last));
     return s;
 }

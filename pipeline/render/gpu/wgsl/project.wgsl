@@ -65,7 +65,7 @@ fn main(thread: Thread) {
         atomicAdd(&dropped, 1u);
         return;
     }
-    if (!(reach > 0.0)) { return; }
+    if (!(reach > 0.0) || !is_ellipse(p, view)) { return; }
     let reach2 = reach / kHalfLog2E;
     let extent = sqrt(reach2 * vec2(p.xx, p.yy));
     let columns = pixel_range(p.centre.x, extent.x, view.size.x);

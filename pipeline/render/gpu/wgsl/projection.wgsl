@@ -56,6 +56,11 @@ fn in_camera(mean: vec3<f32>, view: View) -> vec3<f32> {
     return vec3(dot(view.right, d), dot(view.down, d), dot(view.forward, d));
 }
 
+// Whether the ellipsoid of kMinDepthSigmas standard deviations is in front of the camera.
+fn is_ellipse(p: Projected, view: View) -> bool {
+    return p.cam.z > kMinDepthSigmas * length((p.r * view.forward) * p.scale);
+}
+
 fn project(in: Inputs, view: View) -> Projected {
     var p: Projected;
     p.inverse_norm = 1.0 / quat_norm(in.quat);

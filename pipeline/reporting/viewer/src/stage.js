@@ -3,6 +3,8 @@
 import * as THREE from "three";
 import { dyno, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
+import { projectAsRasterizer } from "./projection.js";
+
 const FAR = 1e4;
 // Gaussians fade between these multiples of the scene's reach when the viewpoint leaves its hull.
 const FADE = [1.1, 1.6];
@@ -44,6 +46,7 @@ export class Stage {
       accumExtSplats: true,
       enableLod: false,
     });
+    projectAsRasterizer(this.spark);
     this.splats = new SplatMesh({
       fileBytes: bytes(document.getElementById("splats").textContent),
       extSplats: true,

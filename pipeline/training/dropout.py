@@ -30,7 +30,8 @@ class ThinnedOpacities:
 
     Attributes:
         logits: (N,) logits.
-        derivative: (N,) their derivative with respect to the logits of the Gaussians.
+        derivative: (N,) their derivative with respect to the logits of the Gaussians, at most
+            1 / (1 - share), so that opaque Gaussians keep a gradient.
     """
 
     logits: Tensor

@@ -29,6 +29,7 @@ from pipeline.io.posefiles import (
 )
 from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
+from pipeline.plan.few_views import FewViews, choose_few
 from pipeline.plan.given_cameras import check_given
 from pipeline.plan.ground_control import GroundControlFile, find_ground_control
 from pipeline.plan.inventory import Inventory
@@ -36,6 +37,7 @@ from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.pose_names import Part, check_pose_names, split_of, without_linear_pairs
+from pipeline.plan.protocols import recognise
 from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
@@ -84,6 +86,12 @@ class Scan(BaseModel):
     ground_control_text: str = ""
     frames: tuple[Photo, ...] = ()
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
+    few_views: str = ""
+    """The plan's sentence about the choice of ``split.train_views``; empty without."""
+    num_unused: int = 0
+    """The number of photographs that this choice leaves out."""
+    published: str | None = None
+    """The title of the published scene that the folder is (``PUBLISHED_SCENES``)."""
     maybe_panoramas: tuple[str, ...] = ()
     """Photographs of which only the aspect ratio is that of a panorama."""
     unused: tuple[str, ...] = ()
@@ -105,7 +113,10 @@ class Scan(BaseModel):
 
     @property
     def planned(self) -> tuple[Photo, ...]:
-        """The photographs and ``frames``: the plan settles options by their number and size."""
+        """The photographs and ``frames``: the plan settles options by their number and size. Of
+        few views (``split.train_views``), the training views."""
+        if self.few_views:
+            return tuple(photo for photo in self.photos if photo.split != "test")
         return (*self.photos, *self.frames)
 
     @property
@@ -148,7 +159,8 @@ class Scan(BaseModel):
 
     @property
     def num_test(self) -> int:
-        """The number of test views of the scene's own split; 0 if it has none."""
+        """The number of test views of the scene's own split, or beside ``few_views``; 0 if it has
+        neither."""
         return sum(photo.split == "test" for photo in self.photos)
 
     @property
@@ -206,7 +218,19 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
     if not videos and len(facts) < max(at.config.inspect.min_images, 1):
         _raise_too_few(at, chosen, poses, len(facts), [*chosen.names, *listed_videos])
     posed = poses is not None or bool(at.faults)
-    photos, facts = _used_photographs(at, chosen, poses, facts)
+    split: dict[str, Part | None] = {}
+    with at.faults.of("unlisted"):
+        if poses is not None:
+            check_pose_names(at, poses, chosen, sorted(facts))
+        split = split_of(at, poses, chosen, sorted(facts))
+    facts = {name: facts[name] for name in sorted(facts) if not split or split[name]}
+    published = recognise(at.path.name, list(facts), at.config.split.train_views)
+    few = FewViews({name: split.get(name) for name in facts})
+    if at.config.split.train_views is not None and not at.faults:
+        with at.faults.of("unlisted"):
+            few = choose_few(at, poses, chosen, few.split, published)
+        facts = {name: facts[name] for name in facts if few.split[name]}
+    photos = _used_photographs(at, chosen, facts, few.split)
     extent = _check_headers(at, chosen, poses, photos, facts, posed=posed)
     control = GroundControlFile()
     with at.faults.of():
@@ -232,13 +256,16 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
         base_folder=chosen.base,
         image_folder_reason=chosen.reason if facts else "no photographs",
         listed=tuple(chosen.names),
-        poses=poses,
+        poses=poses.without_points() if poses is not None and few.text else poses,
         ordered=why_ordered(photos, len(videos)),
         ground_control=control.path,
         ground_control_text=control.text,
         cloud=cloud,
         unused=tuple(unused),
         given_extent=extent,
+        few_views=few.text,
+        num_unused=few.num_unused,
+        published=published and published.title,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=at.digest_of_files(truth_files) if truth is not None else None,
@@ -309,17 +336,10 @@ def _raise_too_few(
 def _used_photographs(
     at: SceneFolder,
     chosen: PhotoFolder,
-    poses: GivenPoses | None,
-    facts: dict[str, FileFacts],
-) -> tuple[list[Photo], dict[str, FileFacts]]:
-    """The photographs that have a pose, if any has, and a part in the scene's own split, if there
-    is one, with their masks and depth maps; and those entries of ``facts`` that describe them."""
-    split: dict[str, Part | None] = {}
-    with at.faults.of("unlisted"):
-        if poses is not None:
-            check_pose_names(at, poses, chosen, sorted(facts))
-        split = split_of(at, poses, chosen, sorted(facts))
-    facts = {name: facts[name] for name in sorted(facts) if not split or split[name]}
+    facts: Mapping[str, FileFacts],
+    split: Mapping[str, Part | None],
+) -> list[Photo]:
+    """The photographs with these facts, with their masks, depth maps and parts in the split."""
     masks: dict[str, Path] = {}
     depths: dict[str, Path] = {}
     with at.faults.of("masks"):
@@ -341,10 +361,10 @@ def _used_photographs(
             depth_digest=at.digest(depth) if depth else None,
             camera_group=found.camera_group,
             panorama=found.panorama == "full",
-            split=split.get(name),
+            split=split[name],
         )
         photos.append(photo)
-    return photos, facts
+    return photos
 
 
 def _check_headers(

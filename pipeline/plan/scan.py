@@ -27,17 +27,16 @@ from pipeline.io.posefiles import (
     pose_files,
     truth_folder,
 )
+from pipeline.plan.chosen_views import ChosenViews, choose_views
 from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
-from pipeline.plan.few_views import FewViews, choose_few
 from pipeline.plan.given_cameras import check_given
 from pipeline.plan.ground_control import GroundControlFile, find_ground_control
 from pipeline.plan.inventory import Inventory
 from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
-from pipeline.plan.pose_names import Part, check_pose_names, split_of, without_linear_pairs
-from pipeline.plan.protocols import recognise
+from pipeline.plan.pose_names import without_linear_pairs
 from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
@@ -218,19 +217,9 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
     if not videos and len(facts) < max(at.config.inspect.min_images, 1):
         _raise_too_few(at, chosen, poses, len(facts), [*chosen.names, *listed_videos])
     posed = poses is not None or bool(at.faults)
-    split: dict[str, Part | None] = {}
-    with at.faults.of("unlisted"):
-        if poses is not None:
-            check_pose_names(at, poses, chosen, sorted(facts))
-        split = split_of(at, poses, chosen, sorted(facts))
-    facts = {name: facts[name] for name in sorted(facts) if not split or split[name]}
-    published = recognise(at.path.name, list(facts), at.config.split.train_views)
-    few = FewViews({name: split.get(name) for name in facts})
-    if at.config.split.train_views is not None and not at.faults:
-        with at.faults.of("unlisted"):
-            few = choose_few(at, poses, chosen, few.split, published)
-        facts = {name: facts[name] for name in facts if few.split[name]}
-    photos = _used_photographs(at, chosen, facts, few.split)
+    views = choose_views(at, poses, chosen, sorted(facts))
+    photos = _used_photographs(at, chosen, {name: facts[name] for name in views.split}, views)
+    facts = {photo.name: facts[photo.name] for photo in photos}
     extent = _check_headers(at, chosen, poses, photos, facts, posed=posed)
     control = GroundControlFile()
     with at.faults.of():
@@ -256,16 +245,16 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
         base_folder=chosen.base,
         image_folder_reason=chosen.reason if facts else "no photographs",
         listed=tuple(chosen.names),
-        poses=poses.without_points() if poses is not None and few.text else poses,
+        poses=poses.without_points() if poses is not None and views.few else poses,
         ordered=why_ordered(photos, len(videos)),
         ground_control=control.path,
         ground_control_text=control.text,
         cloud=cloud,
         unused=tuple(unused),
         given_extent=extent,
-        few_views=few.text,
-        num_unused=few.num_unused,
-        published=published and published.title,
+        few_views=views.few,
+        num_unused=len(views.split) - len(views.used),
+        published=views.published and views.published.title,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=at.digest_of_files(truth_files) if truth is not None else None,
@@ -337,9 +326,10 @@ def _used_photographs(
     at: SceneFolder,
     chosen: PhotoFolder,
     facts: Mapping[str, FileFacts],
-    split: Mapping[str, Part | None],
+    views: ChosenViews,
 ) -> list[Photo]:
-    """The photographs with these facts, with their masks, depth maps and parts in the split."""
+    """The photographs that are used, with their masks, depth maps and parts in the split. Masks and
+    depth maps of the others in ``facts`` are no unused files."""
     masks: dict[str, Path] = {}
     depths: dict[str, Path] = {}
     with at.faults.of("masks"):
@@ -349,8 +339,8 @@ def _used_photographs(
     at.used.extend([*masks.values(), *depths.values()])
     shared = Photo.model_fields.keys() - {"panorama"}
     photos = []
-    for name, found in facts.items():
-        mask, depth = masks.get(name), depths.get(name)
+    for name in views.used:
+        found, mask, depth = facts[name], masks.get(name), depths.get(name)
         photo = Photo(
             **found.model_dump(include=set(shared)),
             name=name,
@@ -361,7 +351,7 @@ def _used_photographs(
             depth_digest=at.digest(depth) if depth else None,
             camera_group=found.camera_group,
             panorama=found.panorama == "full",
-            split=split[name],
+            split=views.split[name],
         )
         photos.append(photo)
     return photos

@@ -253,8 +253,8 @@ def _measure_test_views(
     threads: int,
 ) -> list[MeasuredView]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
-    measured = [item for item in evaluation.per_view if item.name in by_name]
-    items = evenly_spaced(measured, MAX_TEST_VIEWS)
+    tested = [item for item in evaluation.per_view if item.name in by_name]
+    items = evenly_spaced(tested, MAX_TEST_VIEWS)
     views = [by_name[item.name] for item in items]
     test_probes = list(render_probes(views, render))
     maps = trust_maps(test_probes, probes, background_depth, threads)

@@ -114,6 +114,6 @@ def _numbers_of_papers(scan: Scan) -> str:
 
 
 def _either(items: Iterable[object]) -> str:
-    """ "3, 6 or 9"."""
+    """The items in words: "3, 6 or 9"."""
     *first, last = map(str, items)
     return f"{', '.join(first)} or {last}" if first else last

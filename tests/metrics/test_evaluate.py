@@ -57,9 +57,9 @@ def nothing():
     )
 
 
-def measure(views, out, split=Split(), **train):
+def measure(views, out, split=None, **train):
     config = Train(background=train.pop("background", "black"), **train)
-    protocol = choose_protocol(views, split, config)
+    protocol = choose_protocol(views, split or Split(), config)
     return evaluate_views(nothing(), protocol, Evaluate(), config, out, threads=1)
 
 

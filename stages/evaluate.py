@@ -26,7 +26,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     truth = ["pose errors with respect to sparse_gt/"] if scan.truth is not None else []
     reason = f"one view in {every}, sorted by name, is a test view"
     if scan.num_test:
-        reason = f"{scan.num_test} test views: the split that the given poses list"
+        reason = f"{scan.num_test} test views"
+        reason += "" if scan.few_views else ": the split that the given poses list"
     elif every == 0:
         reason = "no test views: measured on the training views"
     published = [settled.why["split.source"]] if settled.why["split.source"] else []

@@ -44,7 +44,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         return StagePlan(run=True, reason="Gaussians from the sparse points of sfm")
     if count := scan.poses.num_points:
         return StagePlan(run=True, reason=f"Gaussians from the given {count} sparse points")
-    reason = "Gaussians from points triangulated with the given poses, which have no points"
+    points = "whose points are not used" if scan.few_views else "which have no points"
+    reason = f"Gaussians from points triangulated with the given poses, {points}"
     pairs = "pairs of cameras with near positions and similar directions"
     return StagePlan(run=True, reason=reason, decisions=[pairs])
 
@@ -82,13 +83,13 @@ def work(job: Job) -> None:
     elif placed is not None:
         points, source = placed, "the point cloud"
     elif config.method != "random" and len(points) == 0:
-        job.decide("the given poses have no points: points are triangulated")
+        job.decide("there are no given points: points are triangulated")
         triangulated = job.scratch / "triangulation"
         sections = job.section(Features), job.section(Matches)
         manifest = inputs.read_manifest(job, "views")
         if any(view.has_listed_split for view in training):
             manifest = manifest.only({view.name for view in training})
-            job.decide("test views of the scene's own split are not used for points")
+            job.decide("test views are not used for points")
         report = triangulate(
             manifest,
             job.inputs["model"] / "sparse" / "0",

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     reason = contents(len(scan.photos), len(scan.videos))
     decisions = [scan.image_folder_reason, *converted_colours(scan.photos)]
+    decisions += [scan.few_views] if scan.few_views else []
     return StagePlan(run=True, reason=reason, decisions=decisions)
 
 
@@ -61,6 +62,8 @@ def work(job: Job) -> None:
         given = load_given(
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
+        if found.few_views:
+            given = given.without_points()
         job.add_messages(given.write(job.out), [])
         if config.poses != "trust":
             check = check_poses(
@@ -77,9 +80,8 @@ def work(job: Job) -> None:
         write_cloud(job.out, cloud)
         given_counts |= {"cloud_points": cloud.num_read}
         job.add_messages([f"{found.cloud.path}: {cloud.text}"], [])
-    job.counters = InspectCounters(
-        photos=count, left_out=len(found.listed) - count, videos=videos, **given_counts
-    )
+    left_out = len(found.listed) - found.num_unused - count
+    job.counters = InspectCounters(photos=count, left_out=left_out, videos=videos, **given_counts)
     if found.ground_control is not None and found.poses is None:
         write_bytes(job.out / GCP_FILE, found.ground_control.read_bytes())
     if found.truth is not None:
@@ -97,7 +99,7 @@ SPEC = StageSpec(
     decide=decide,
     counters=InspectCounters,
     options=(
-        *("poses", "inspect", "experiments.inspect", "views.masks", "split.source"),
+        *("poses", "inspect", "experiments.inspect", "views.masks", "split"),
         *("init.points_file", "sfm.georeference"),
     ),
     facts=facts,

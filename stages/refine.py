@@ -32,6 +32,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         )
     if freed == "no":
         return StagePlan(run=False, reason="principal points are fixed, as configured")
+    if scan.few_views:
+        return StagePlan(run=False, reason="the given tracks are not used (split.train_views)")
     if poses.tracked < MIN_TRACKED:
         few = f"an image with only {poses.tracked} tracked points" if poses.tracked else "no tracks"
         return StagePlan(run=False, reason=f"the given model has {few}, too few for adjustment")

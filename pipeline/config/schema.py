@@ -87,6 +87,13 @@ class Split(Section):
         description="Every n-th view, sorted by name, is a test view (3DGS: 8). 0: no test views; "
         "evaluation uses the training views, and the protocol in metrics.json says so.",
     )
+    train_views: Annotated[int, Field(ge=2, le=MAX_PHOTOS), Unit("views")] | None = Field(
+        None,
+        description="Trains on this number of views, evenly spaced among those that are no test "
+        "views, as papers on few views do; with source: published on those that the papers list. "
+        "Other photographs are not used, nor are given sparse points. Poses must be given. null: "
+        "all views that are no test views.",
+    )
 
 
 class Decode(Section):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +47,8 @@ from pipeline.runtime.progress import track
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
-from pipeline.scene.views import View, scene_up
+from pipeline.scene.views import View, evenly_spaced, scene_up
 from pipeline.splats.gaussians import Gaussians
-
-T = TypeVar("T")
 
 #: Largest numbers of training views, of test views, and of training views whose surface points are
 #: counted. Larger sets are sampled evenly.
@@ -154,7 +152,7 @@ def measure_coverage(
     def render(view: View) -> Render:
         return render_view(gaussians, view, options)
 
-    training = _evenly([view for view in views if not view.is_test], MAX_TRAINING_VIEWS)
+    training = evenly_spaced([view for view in views if not view.is_test], MAX_TRAINING_VIEWS)
     rendered = render_probes(training, render)
     probes = list(track(rendered, "rendering training views", len(training), unit="views"))
     depths = np.concatenate([probe.depth[~probe.empty] for probe in probes])
@@ -168,7 +166,7 @@ def measure_coverage(
         record.write(out)
         return record
     background_depth = float(np.percentile(depths, 95))
-    surface, nearest = _surface(_evenly(probes, MAX_SAMPLED), probes, background_depth)
+    surface, nearest = _surface(evenly_spaced(probes, MAX_SAMPLED), probes, background_depth)
     tested = _measure_test_views(
         evaluation, renders, protocol, probes, render, background_depth, nearest, threads
     )
@@ -210,11 +208,6 @@ def measure_coverage(
 def _with_images(record: ViewCoverage, images: Mapping[str, Images]) -> ViewCoverage:
     found = images.get(record.name)
     return record if found is None else record.model_copy(update=found._asdict())
-
-
-def _evenly(items: Sequence[T], count: int) -> list[T]:
-    picks = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[i] for i in picks]
 
 
 def _named(views: Sequence[View], name: str) -> View:
@@ -260,7 +253,8 @@ def _measure_test_views(
     threads: int,
 ) -> list[MeasuredView]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
-    items = _evenly([item for item in evaluation.per_view if item.name in by_name], MAX_TEST_VIEWS)
+    tested = [item for item in evaluation.per_view if item.name in by_name]
+    items = evenly_spaced(tested, MAX_TEST_VIEWS)
     views = [by_name[item.name] for item in items]
     test_probes = list(render_probes(views, render))
     maps = trust_maps(test_probes, probes, background_depth, threads)

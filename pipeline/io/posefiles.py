@@ -76,6 +76,10 @@ class GivenPoses(PoseSummary):
     splits: dict[str, ListedSplit] = {}
     lost: tuple[str, ...] = ()
 
+    def without_points(self) -> GivenPoses:
+        """The poses as if the pose files had no sparse points."""
+        return self.model_copy(update={"num_points": 0, "tracked": 0})
+
     @property
     def format(self) -> PoseFormat:
         return format_of(self.kind)

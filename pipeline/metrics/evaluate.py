@@ -248,6 +248,11 @@ def _sizes(views: Sequence[View]) -> tuple[str, ...]:
 
 
 def _describe_split(protocol: Protocol) -> str:
+    if protocol.listed and protocol.train_views is not None:
+        return (
+            f"{protocol.num_training} training views (split.train_views) and {len(protocol.views)} "
+            "test views; other photographs are not used"
+        )
     if protocol.listed:
         return (
             f"test views: the scene's own split, listed with its poses: {protocol.num_training} "

@@ -9,6 +9,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field
 
 from pipeline.metrics.pose import PoseError
+from pipeline.plan.protocols import scene_title
 from pipeline.runtime.json_file import JsonFile, JsonObject, Vector3, mismatch
 
 
@@ -30,6 +31,11 @@ class PublishedProtocol(JsonObject):
 
     benchmark: str = Field(description="Name of the data set.")
     scene: str = Field(description="Name of the scene in it.")
+    train_views: int | None = Field(
+        None,
+        description="Number of training views of papers on few views; null: all that are no test "
+        "views.",
+    )
     deviations: tuple[str, ...] = Field(
         description="What was done otherwise than papers on 3D Gaussian splatting do with this "
         "scene. Only without any do the measures compare with published ones."
@@ -38,9 +44,10 @@ class PublishedProtocol(JsonObject):
     @property
     def text(self) -> str:
         """In words."""
+        title = scene_title(self.scene, self.benchmark, self.train_views)
         if not self.deviations:
-            return f"{self.scene} of {self.benchmark}, measured as published"
-        return f"{self.scene} of {self.benchmark}, NOT as published: {'; '.join(self.deviations)}"
+            return f"{title}, measured as published"
+        return f"{title}, NOT as published: {'; '.join(self.deviations)}"
 
 
 class ProtocolDescription(JsonObject):

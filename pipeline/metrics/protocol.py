@@ -6,12 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipeline.config.schema import Split, Train
 from pipeline.render import BACKGROUNDS, Color, RasterOptions
 from pipeline.render.views import near_plane
-from pipeline.scene.views import View, scene_extent
+from pipeline.scene.views import View, evenly_spaced, scene_extent
 
 #: Number of training views that are rendered for ``train_psnr``.
 NUM_TRAINING_VIEWS = 8
@@ -24,10 +22,11 @@ class Protocol:
     Attributes:
         views: The evaluated views: the test views, or all views if there are none.
         training_views: An even sample of the training views; empty without test views.
-        every: Every n-th view, sorted by name, is a test view; 0: there are none, or the scene's
-            own split lists them.
+        every: Every n-th view, sorted by name, is a test view; 0: there are none, or ``listed``.
         num_training: The number of training views.
-        listed: Whether the views are test views of the scene's own split.
+        listed: Whether the views are test views of the scene's own split, or of the choice of
+            ``split.train_views``.
+        train_views: The value of ``split.train_views``.
         background: RGB in [0, 1] behind renders and transparent photographs.
         near: The near plane of the renders, as in training; world units.
         extent: The radius of the scene, world units (``scene_extent``).
@@ -41,6 +40,7 @@ class Protocol:
     extent: float
     num_training: int
     listed: bool
+    train_views: int | None = None
 
     @property
     def has_test_views(self) -> bool:
@@ -65,20 +65,16 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
     """
     test = [view for view in views if view.is_test]
     training = [view for view in views if not view.is_test]
-    picks = (
-        np.linspace(0, len(training) - 1, min(NUM_TRAINING_VIEWS, len(training)))
-        .round()
-        .astype(int)
-    )
     extent = scene_extent(list(views))
     listed = any(view.has_listed_split for view in test)
     return Protocol(
         test or list(views),
-        [training[i] for i in picks] if test else [],
+        evenly_spaced(training, NUM_TRAINING_VIEWS) if test else [],
         split.test_every if test and not listed else 0,
         BACKGROUNDS["white" if train.background in ("white", "random") else "black"],
         near_plane(extent),
         extent,
         len(training),
         listed,
+        split.train_views,
     )

@@ -18,7 +18,7 @@ def against_published(
     """The published benchmark of a scene, with all that was done otherwise.
 
     Args:
-        name: A scene of ``PUBLISHED_SCENES``.
+        name: The title of a scene of ``PUBLISHED_SCENES``.
         deviations: The deviations that are known from the plan.
         protocol, evaluation: The protocol of the measurement and its result.
     """
@@ -42,12 +42,24 @@ def against_published(
         found.append(f"SSIM: {described.ssim}")
     if evaluation.lpips is not None and described.lpips != LPIPS_VARIANTS["vgg"]:
         found.append(f"LPIPS: {described.lpips}, not {LPIPS_VARIANTS['vgg']}")
-    return PublishedProtocol(benchmark=scene.benchmark, scene=scene.scene, deviations=tuple(found))
+    return PublishedProtocol(
+        benchmark=scene.benchmark,
+        scene=scene.scene,
+        train_views=scene.train_views,
+        deviations=tuple(found),
+    )
 
 
 def _test_views(scene: PublishedScene, protocol: Protocol) -> list[str]:
-    """How the measured views differ from the published ones."""
-    views = len(protocol.views)
+    """How training and test views differ from the published ones."""
+    views, training = len(protocol.views), protocol.num_training
+    if protocol.train_views != scene.train_views:
+        return [f"only {training} training views"]
+    if scene.train_views is not None:
+        found = [] if views == scene.num_test else [f"{views} test views, not {scene.num_test}"]
+        if training != scene.train_views:
+            found.append(f"{training} training views, not {scene.train_views}")
+        return found
     if scene.every is None:
         if not protocol.listed:
             return ["test views are not those that the data set lists"]

@@ -15,7 +15,7 @@ from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION
 from pipeline.runtime.errors import UserError
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.reconstruction import Points
-from pipeline.scene.views import View
+from pipeline.scene.views import View, evenly_spaced
 from pipeline.scene.visibility import projected, visible
 
 # A cloud with fewer points in the views is probably in another place.
@@ -101,7 +101,7 @@ def _resolution(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.f
     over a sample of the views, occlusion ignored. Voxels in inverse proportion to it have about
     equally many pixels each."""
     total = np.zeros(len(xyz))
-    for view in _evenly(views, _RESOLUTION_VIEWS):
+    for view in evenly_spaced(views, _RESOLUTION_VIEWS):
         _, z, inside = projected(xyz, view)
         total[inside] += view.fx * view.fy / z[inside] ** 2
     known = total[total > 0]
@@ -109,16 +109,11 @@ def _resolution(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.f
     return np.sqrt(np.where(total > 0, total, least))
 
 
-def _evenly(views: Sequence[View], count: int) -> list[View]:
-    chosen = np.linspace(0, len(views) - 1, min(len(views), count)).round().astype(int)
-    return [views[i] for i in chosen]
-
-
 def _colours(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.uint8]:
     """(N, 3) colours from the photographs: of the nearest view in which a point is not hidden."""
     rgb = np.full((len(xyz), 3), _GREY, np.uint8)
     nearest = np.full(len(xyz), np.inf)
-    for view in _evenly(views, _COLOUR_VIEWS):
+    for view in evenly_spaced(views, _COLOUR_VIEWS):
         found = projected(xyz, view)
         rows = visible(found, view)
         rows = rows[found.z[rows] < nearest[rows]]

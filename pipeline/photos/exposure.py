@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.photos.load import load_view
 from pipeline.scene.reconstruction import Reconstruction
-from pipeline.scene.views import View
+from pipeline.scene.views import View, evenly_spaced
 
 #: Stops per unit of log2 in display values: the sRGB curve is close to a power of 1 / 2.2.
 GAMMA = 2.2
@@ -83,8 +83,7 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
 
 def sample_views(views: Sequence[View]) -> list[View]:
     """Up to ``SAMPLE`` views, evenly spaced."""
-    picks = np.linspace(0, len(views) - 1, min(SAMPLE, len(views))).round().astype(int)
-    return [views[i] for i in picks]
+    return evenly_spaced(views, SAMPLE)
 
 
 def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -67,6 +67,14 @@ class GivenModel:
         model = rounding.model(normalization.model_to_scene(given))
         return cls(model, normalization, Unrounded.of(given, rounding))
 
+    def without_points(self) -> GivenModel:
+        """The poses alone."""
+        return replace(
+            self,
+            model=replace(self.model, points=Points.empty()),
+            unrounded=replace(self.unrounded, points=np.zeros((0, 3))),
+        )
+
     def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The (..., 3) points of the given world, in the scene's world and rounded."""
         return self.unrounded.rounding.points(self.normalization.to_scene(points))

@@ -12,7 +12,7 @@ from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
 from pipeline.io.names import NameIndex, compare_names
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import GivenPoses, listed_photos
-from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
+from pipeline.plan.protocols import recognise
 from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.errors import UserError
 
@@ -82,7 +82,7 @@ def _choose_copy(at: SceneFolder, copies: Sequence[str], poses: GivenPoses | Non
     longest, full = found[0]
     usable = [entry for entry in found if _is_complete(at, entry[1], full, poses)]
     large_enough = [entry for entry in usable if entry[0] >= needed]
-    published = PUBLISHED_SCENES.get(benchmark_scene(at.path.name))
+    published = recognise(at.path.name, full.names, at.config.split.train_views)
     wanted = published.image_folder if published and published.image_folder != "images" else None
     of_papers = [entry for entry in usable if entry[1].path == wanted]
     if of_papers:

@@ -13,7 +13,6 @@ from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.budget import training_memory_mb, typical_view
 from pipeline.plan.panoramas import panorama_hints
-from pipeline.plan.published import published_scene
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import PROCESSOR, Choice, gps_extent_m, settle
@@ -149,7 +148,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
     photos = scan.planned
     sizes = Counter(f"{photo.width}x{photo.height}" for photo in photos)
     groups = Counter(photo.camera_group for photo in photos)
-    poses, published = scan.poses, published_scene(scan)
+    poses = scan.poses
     return SceneFacts(
         photographs=len(scan.photos),
         videos=len(scan.videos),
@@ -175,7 +174,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         training_memory_mb=training_memory_mb(scan, config),
         given_poses=poses
         and PoseSummary.model_validate(poses.model_dump(exclude={"names", "splits", "lost"})),
-        published_scene=published and published.scene,
+        published_scene=scan.published,
         truth="sparse_gt" if scan.truth is not None else None,
         truth_digest=scan.truth_digest,
         fingerprint=scan.fingerprint,

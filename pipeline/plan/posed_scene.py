@@ -125,7 +125,9 @@ def _finished(
     if max_long_side is not None:
         views = views.model_copy(update={"max_long_side_px": max_long_side})
     if every is not None:
-        split = split.model_copy(update={"source": "every", "test_every": every})
+        split = split.model_copy(
+            update={"source": "every", "test_every": every, "train_views": None}
+        )
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
     manifest = Manifest.read(photos)
     model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"), points=False)

@@ -27,6 +27,7 @@ from pipeline.io.posefiles import (
     pose_files,
     truth_folder,
 )
+from pipeline.plan.chosen_views import ChosenViews, choose_views
 from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
 from pipeline.plan.given_cameras import check_given
@@ -35,7 +36,7 @@ from pipeline.plan.inventory import Inventory
 from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
-from pipeline.plan.pose_names import Part, check_pose_names, split_of, without_linear_pairs
+from pipeline.plan.pose_names import without_linear_pairs
 from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
@@ -84,6 +85,12 @@ class Scan(BaseModel):
     ground_control_text: str = ""
     frames: tuple[Photo, ...] = ()
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
+    few_views: str = ""
+    """The plan's sentence about the choice of ``split.train_views``; empty without."""
+    num_unused: int = 0
+    """The number of photographs that this choice leaves out."""
+    published: str | None = None
+    """The title of the published scene that the folder is (``PUBLISHED_SCENES``)."""
     maybe_panoramas: tuple[str, ...] = ()
     """Photographs of which only the aspect ratio is that of a panorama."""
     unused: tuple[str, ...] = ()
@@ -105,7 +112,10 @@ class Scan(BaseModel):
 
     @property
     def planned(self) -> tuple[Photo, ...]:
-        """The photographs and ``frames``: the plan settles options by their number and size."""
+        """The photographs and ``frames``: the plan settles options by their number and size. Of
+        few views (``split.train_views``), the training views."""
+        if self.few_views:
+            return tuple(photo for photo in self.photos if photo.split != "test")
         return (*self.photos, *self.frames)
 
     @property
@@ -148,7 +158,8 @@ class Scan(BaseModel):
 
     @property
     def num_test(self) -> int:
-        """The number of test views of the scene's own split; 0 if it has none."""
+        """The number of test views of the scene's own split, or beside ``few_views``; 0 if it has
+        neither."""
         return sum(photo.split == "test" for photo in self.photos)
 
     @property
@@ -206,7 +217,9 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
     if not videos and len(facts) < max(at.config.inspect.min_images, 1):
         _raise_too_few(at, chosen, poses, len(facts), [*chosen.names, *listed_videos])
     posed = poses is not None or bool(at.faults)
-    photos, facts = _used_photographs(at, chosen, poses, facts)
+    views = choose_views(at, poses, chosen, sorted(facts))
+    photos = _used_photographs(at, chosen, {name: facts[name] for name in views.split}, views)
+    facts = {photo.name: facts[photo.name] for photo in photos}
     extent = _check_headers(at, chosen, poses, photos, facts, posed=posed)
     control = GroundControlFile()
     with at.faults.of():
@@ -232,13 +245,16 @@ def _scan(at: SceneFolder, scene: str) -> Scan:
         base_folder=chosen.base,
         image_folder_reason=chosen.reason if facts else "no photographs",
         listed=tuple(chosen.names),
-        poses=poses,
+        poses=poses.without_points() if poses is not None and views.few else poses,
         ordered=why_ordered(photos, len(videos)),
         ground_control=control.path,
         ground_control_text=control.text,
         cloud=cloud,
         unused=tuple(unused),
         given_extent=extent,
+        few_views=views.few,
+        num_unused=len(views.split) - len(views.used),
+        published=views.published and views.published.title,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=at.digest_of_files(truth_files) if truth is not None else None,
@@ -309,17 +325,11 @@ def _raise_too_few(
 def _used_photographs(
     at: SceneFolder,
     chosen: PhotoFolder,
-    poses: GivenPoses | None,
-    facts: dict[str, FileFacts],
-) -> tuple[list[Photo], dict[str, FileFacts]]:
-    """The photographs that have a pose, if any has, and a part in the scene's own split, if there
-    is one, with their masks and depth maps; and those entries of ``facts`` that describe them."""
-    split: dict[str, Part | None] = {}
-    with at.faults.of("unlisted"):
-        if poses is not None:
-            check_pose_names(at, poses, chosen, sorted(facts))
-        split = split_of(at, poses, chosen, sorted(facts))
-    facts = {name: facts[name] for name in sorted(facts) if not split or split[name]}
+    facts: Mapping[str, FileFacts],
+    views: ChosenViews,
+) -> list[Photo]:
+    """The photographs that are used, with their masks, depth maps and parts in the split. Masks and
+    depth maps of the others in ``facts`` are no unused files."""
     masks: dict[str, Path] = {}
     depths: dict[str, Path] = {}
     with at.faults.of("masks"):
@@ -329,8 +339,8 @@ def _used_photographs(
     at.used.extend([*masks.values(), *depths.values()])
     shared = Photo.model_fields.keys() - {"panorama"}
     photos = []
-    for name, found in facts.items():
-        mask, depth = masks.get(name), depths.get(name)
+    for name in views.used:
+        found, mask, depth = facts[name], masks.get(name), depths.get(name)
         photo = Photo(
             **found.model_dump(include=set(shared)),
             name=name,
@@ -341,10 +351,10 @@ def _used_photographs(
             depth_digest=at.digest(depth) if depth else None,
             camera_group=found.camera_group,
             panorama=found.panorama == "full",
-            split=split.get(name),
+            split=views.split[name],
         )
         photos.append(photo)
-    return photos, facts
+    return photos
 
 
 def _check_headers(

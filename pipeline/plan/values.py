@@ -84,8 +84,8 @@ class SceneFacts(BaseModel):
     given_poses: PoseSummary | None = Field(description="null where no poses are given or used.")
     published_scene: str | None = Field(
         None,
-        description="Scene of a published benchmark that the folder is, by its name and its "
-        "photographs; null for others.",
+        description="Scene of a published benchmark that the folder is, by its name, its "
+        "photographs and `split.train_views`; null for others.",
     )
     truth: str | None = Field(description="Folder of ground truth poses; null without any.")
     truth_digest: str | None = Field(description="Digest of the ground truth poses.")

@@ -64,7 +64,8 @@ class Photo(BaseModel):
     taken: str | None = None
     """Time of exposure from EXIF, ISO 8601."""
     split: Literal["train", "test"] | None = None
-    """Its part of the scene's own split; null for scenes without one."""
+    """Its part of the scene's own split, or of the choice of ``split.train_views``; null for scenes
+    with neither."""
 
     @model_validator(mode="after")
     def _files_have_digests(self) -> Photo:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import posixpath
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from pipeline.config import schema
 from pipeline.geometry.up_direction import up_direction
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,8 @@ class View:
         world_to_camera: (4, 4) float64.
         is_test: Whether this is a test view, which is not trained on.
         camera_id: The key into ``Reconstruction.cameras``; views of one camera share intrinsics.
-        has_listed_split: Whether the scene's own split says if this is a test view.
+        has_listed_split: Whether the scene's own split, or the choice of ``split.train_views``,
+            says if this is a test view.
         image_digest, mask_digest: The digests of the files, checked when they are read; None: no
             check.
         source: The name of the photograph of which this is a part; None for a whole photograph.
@@ -95,6 +99,13 @@ def is_test_view(index: int, every: int) -> bool:
     return every > 0 and index % every == 0
 
 
+def evenly_spaced(items: Sequence[T], number: int) -> list[T]:
+    """``number`` of the items, evenly spaced from the first to the last; all if there are fewer.
+    Positions are rounded to integers, halves to even ones, as in RegNeRF (Niemeyer et al. 2022)."""
+    places = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
+    return [items[i] for i in places]
+
+
 def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
     """Width and height in pixels, reduced so that neither exceeds ``max_long_side``; the aspect
     ratio stays the same up to rounding."""
@@ -117,7 +128,7 @@ def load_views(
 
     Args:
         views: The largest side of a view, and whether masks are used.
-        split: The choice of test views.
+        split: The choice of test views. Those of ``train_views`` are marked in the manifest.
 
     Raises:
         ValueError: a camera has lens distortion; undistort the photographs first.
@@ -125,7 +136,8 @@ def load_views(
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
     parts = {photo.split for photo in photos}
-    listed = split.source != "every" and parts == {"train", "test"}
+    marked = split.source != "every" or split.train_views is not None
+    listed = marked and parts == {"train", "test"}
     # Views of one photograph are all test views or all training views: they overlap.
     sources = {name: i for i, name in enumerate(sorted({p.source or p.name for p in photos}))}
     # A single photograph is for training.

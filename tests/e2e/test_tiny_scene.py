@@ -170,7 +170,11 @@ def test_a_changed_mask_is_noticed_and_new_truth_measures_only(project):
 
 
 # What the tiny scene or this machine lacks: ground control points, a published benchmark.
-NOT_PLANNED = {'sfm={"georeference": "gcp"}', 'split={"source": "published"}'}
+NOT_PLANNED = {
+    'sfm={"georeference": "gcp"}',
+    'split={"source": "published"}',
+    'split={"source": "published", "train_views": 3}',
+}
 
 
 def test_the_configurations_in_commands_of_the_docs_are_planned(project, monkeypatch):

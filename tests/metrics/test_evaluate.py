@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -55,9 +57,9 @@ def nothing():
     )
 
 
-def measure(views, out, **train):
+def measure(views, out, split=None, **train):
     config = Train(background=train.pop("background", "black"), **train)
-    protocol = choose_protocol(views, Split(), config)
+    protocol = choose_protocol(views, split or Split(), config)
     return evaluate_views(nothing(), protocol, Evaluate(), config, out, threads=1)
 
 
@@ -176,6 +178,14 @@ def test_a_mask_of_the_measured_half_hides_the_view(tmp_path):
 def test_the_protocol_reports_a_missing_test_split(tmp_path):
     found = measure([view(tmp_path, "a", black(), is_test=False)], tmp_path / "out")
     assert "TRAINING" in found.protocol.split
+
+
+def test_the_protocol_says_what_few_training_views_leave_out(tmp_path):
+    views = [view(tmp_path, "a", black()), view(tmp_path, "b", black(), is_test=False)]
+    chosen = [replace(view, has_listed_split=True) for view in views]
+    found = measure(chosen, tmp_path / "out", Split(train_views=2)).protocol
+    assert found.split.startswith("1 training views (split.train_views) and 1 test views; other")
+    assert "from the training photographs alone" in found.poses_and_points
 
 
 def test_masked_pixels_are_excluded(tmp_path):

@@ -30,10 +30,13 @@ from tests.plans import make_plan
 PUBLISHED = {"split": {"source": "published"}}
 # Eleven photographs, so that 0 and 8 are test views.
 SMALL = {
-    "bonsai": {"photographs": (11,), "size": (48, 32)},
-    "truck": {"photographs": (11,)},
-    "lego": {"size": (16, 16), "num_test": 3},
-    "scan24": {"photographs": (11,), "size": (32, 24)},
+    "bonsai of Mip-NeRF 360": {"photographs": (11,), "size": (48, 32)},
+    "truck of Tanks and Temples": {"photographs": (11,)},
+    "lego of NeRF-synthetic": {"size": (16, 16), "num_test": 3},
+    "scan24 of DTU": {"photographs": (11,), "size": (32, 24)},
+    "fern of LLFF with 3 training views": {"photographs": (11,), "size": (24, 16), "num_test": 2},
+    "lego of NeRF-synthetic with 8 training views": {"size": (12, 12), "num_test": 1},
+    "scan8 of DTU with 3 training views": {"size": (16, 12)},
 }
 
 
@@ -72,9 +75,22 @@ def nerf_synthetic(folder: Path) -> Path:
     return scene
 
 
-def dtu(folder: Path) -> Path:
-    scene = folder / "scan24"
-    names = [f"{i:04d}.png" for i in range(11)]
+def llff(folder: Path) -> Path:
+    """Without the points of all photographs, which a COLMAP model has beside the poses."""
+    scene = folder / "nerf_llff_data-fern"
+    for suffix, size in (("", (192, 128)), ("_4", (48, 32)), ("_8", (24, 16))):
+        photos(scene / f"images{suffix}", 11, size)
+    write_sparse(scene / "sparse" / "0", [f"p{i:02d}.jpg" for i in range(11)], (192, 128))
+    return scene
+
+
+def dtu_few(folder: Path) -> Path:
+    return dtu(folder, "scan8", 49)
+
+
+def dtu(folder: Path, name: str = "scan24", count: int = 11) -> Path:
+    scene = folder / name
+    names = [f"{i:04d}.png" for i in range(count)]
     for name in names:
         picture(scene / "images" / name, (64, 48), mode="RGBA")
     write_sparse(scene / "sparse" / "0", names, (64, 48))
@@ -118,6 +134,23 @@ def test_a_scene_is_measured_as_published_on_request(benchmark: str, tmp_path: P
     assert found.text.endswith("measured as published")
 
 
+@pytest.mark.parametrize(
+    ("layout", "train_views", "deviations"),
+    [
+        (llff, 3, ()),
+        (nerf_synthetic, 8, ()),
+        (dtu_few, 3, ("whole images are measured, not the object inside of its mask",)),
+    ],
+)
+def test_few_views_are_measured_as_published_on_request(
+    layout: Any, train_views: int, deviations: tuple[str, ...], tmp_path: Path
+) -> None:
+    split = {"source": "published", "train_views": train_views}
+    found = measured(layout(tmp_path), split=split, preset="fast")
+    assert (found.train_views, found.deviations) == (train_views, deviations)
+    assert f"with {train_views} training views, " in found.text
+
+
 @pytest.mark.parametrize("benchmark", LAYOUTS)
 def test_given_poses_and_photographs_stay_as_they_are(benchmark: str, tmp_path: Path) -> None:
     plan = planned(LAYOUTS[benchmark](tmp_path), **PUBLISHED)
@@ -136,6 +169,10 @@ def test_given_poses_and_photographs_stay_as_they_are(benchmark: str, tmp_path: 
         (nerf_synthetic, {"split": {"source": "every"}}, "not those that the data set lists"),
         (dtu, {"split": {"test_every": 8}}, "there are test views"),
         (dtu, {"train": {"background": "white"}}, "the background is not black"),
+        (llff, {"split": {"train_views": 3, "test_every": 5}}, "test views are not every 8th view"),
+        (llff, {"split": {"train_views": 3, "test_every": 5}}, "3 test views, not 2"),
+        (nerf_synthetic, {"split": {"train_views": 8}}, "not those that papers list"),
+        (mip_nerf_360, {"split": {"train_views": 5}}, "only 5 training views"),
     ],
 )
 def test_what_differs_from_the_published_protocol_is_named(
@@ -223,4 +260,4 @@ def test_names_of_data_sets_are_no_part_of_a_scene() -> None:
     for folder in ("truck", "tandt_truck", "T2-Truck"):
         found = recognise(folder, names)
         assert found is not None and found.scene == "truck"
-    assert recognise("dtu_scan24", names) is PUBLISHED_SCENES["scan24"]
+    assert recognise("dtu_scan24", names) is PUBLISHED_SCENES["scan24 of DTU"]

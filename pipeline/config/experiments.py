@@ -197,6 +197,11 @@ class TrainExperiments(Section):
         description="Share of the Gaussians that is not drawn in a step, at the end of the run; it "
         "rises from 0. null: 0.2 for few training views, else 0 (3DGS: 0).",
     )
+    views_per_sh_coefficient: Annotated[float, Field(ge=0, le=MAX_FACTOR), Unit("views")] = Field(
+        1.0,
+        description="The degree of the spherical harmonics is at most that with one coefficient "
+        "for so many training views. 0: no such limit (3DGS).",
+    )
     learning_rate_decay_start: PartOfRun = Field(
         0.7,
         description="From this point on, all learning rates but that of the means decay "

@@ -52,6 +52,7 @@ PRESETS: dict[str, dict[str, Any]] = {
                 "alpha_loss_weight": 0.0,
                 "clamp_color_gradient": True,
                 "dropout": 0.0,
+                "views_per_sh_coefficient": 0.0,
                 "adam_beta1": 0.9,
                 "adam_epsilon": 0.0,
                 "means_learning_rate_unit": "camera_extent",

@@ -30,7 +30,7 @@ from pipeline.training.data.known_depths import (
     scene_scale,
 )
 from pipeline.training.density.floaters import empty_depths
-from pipeline.training.dropout import dropout_of
+from pipeline.training.few_views import few_views_lines
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
@@ -228,11 +228,8 @@ def _known_depths(
 
 def _describe(result: TrainResult, num_views: int, run: TrainingRun, notes: Notes) -> None:
     notes.warnings += result.warnings
-    if share := dropout_of(run, num_views):
-        notes.decisions.append(
-            f"few training views: in each step, up to {share:.0%} of the Gaussians, chosen at "
-            "random, are not drawn"
-        )
+    if not run.is_part:
+        notes.decisions += few_views_lines(run.options, num_views)
     minutes = run.options.budget_minutes
     if not run.is_part and (
         few := too_few_epochs(result.steps, num_views, result.seconds, minutes)

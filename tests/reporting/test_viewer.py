@@ -135,17 +135,29 @@ def test_the_scene_appears_without_network_requests(page: Any, file: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("file", "antialias"), [(None, False), (None, True), ("scene.ply", False), ("scene.spz", False)]
+    ("file", "antialias", "around"),
+    [
+        (None, False, False),
+        (None, True, False),
+        (None, False, True),
+        ("scene.ply", False, False),
+        ("scene.spz", False, False),
+    ],
 )
 def test_the_viewer_renders_as_our_rasterizer(
-    page: Any, tmp_path: Path, file: str | None, antialias: bool
+    page: Any, tmp_path: Path, file: str | None, antialias: bool, around: bool
 ) -> None:
-    """Spark's render of the page, or of a file of ours in its place, against the rasterizer's.
+    """Spark's render of the page, or of a file of ours in its place, against the rasterizer's; also
+    of large Gaussians around, beside and behind the cameras.
 
     Spark shows coordinates as they are in a file: y up for SPZ, y down for PLY.
     """
     path = tmp_path / "report.html"
-    scene = trained(gaussians=gaussians(3000), background=(0.2, 0.5, 1.0), antialias=antialias)
+    made = gaussians(150 if around else 3000)
+    if around:
+        made.means[:] *= 5
+        made.log_scales[:] += 3
+    scene = trained(gaussians=made, background=(0.2, 0.5, 1.0), antialias=antialias)
     write_report(report(trained=scene), path)
     shown = Gaussians.sharing(scene.gaussians)
     if file is not None:

@@ -125,6 +125,8 @@ FLIPS = {
     f"{_T}.squared_error_loss_weight": Flip(0.0, POSED),
     f"{_T}.alpha_loss_weight": Flip(0.0, POSED, "alpha"),
     f"{_T}.clamp_color_gradient": Flip(True, DARK),
+    f"{_T}.dropout": Flip(0.5, POSED),
+    f"{_T}.views_per_sh_coefficient": Flip(100.0, POSED),
     f"{_T}.max_pose_change": Flip(1e-6, under(poses="keep", train__refine_poses=True)),
     f"{_T}.max_intrinsics_change": Flip(1e-6, under(poses="keep", train__refine_intrinsics=True)),
     f"{_T}.adam_beta1": Flip(0.9, POSED),

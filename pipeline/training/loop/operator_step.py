@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pipeline.render import Backend, Gradients
-from pipeline.training.dropout import ThinnedOpacities, thinned
+from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult

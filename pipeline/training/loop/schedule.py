@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from pipeline.config.settled import TrainOptions
 from pipeline.training.density.timeline import schedule_length, shrunk
+from pipeline.training.few_views import dropout_of, sh_degree_of
 from pipeline.training.optimisers.adam import Rates
 
 COARSE_FACTORS = (4, 2)
@@ -50,6 +51,7 @@ class Schedule:
         coarse_steps: The number of steps at reduced resolution: the first half at 1/4, the others
             at 1/2.
         seen_share: The mean share of the views that see a Gaussian.
+        sh_degree: The maximum degree of the spherical harmonics.
         dropout: The share of the Gaussians that is not drawn in the last step.
     """
 
@@ -58,11 +60,16 @@ class Schedule:
     sh_interval: int
     coarse_steps: int
     seen_share: float
-    dropout: float = 0.0
+    sh_degree: int
+    dropout: float
 
     @staticmethod
-    def of(options: TrainOptions, seen_share: float = 1.0, dropout: float = 0.0) -> Schedule:
-        """The schedule of ``options.steps`` steps, or of ``options.budget_minutes``."""
+    def of(options: TrainOptions, seen_share: float = 1.0, views: int | None = None) -> Schedule:
+        """The schedule of ``options.steps`` steps, or of ``options.budget_minutes``.
+
+        Args:
+            views: The number of training views; None for so many that none of this is limited.
+        """
         minutes, experiments = options.budget_minutes, options.experiments
         steps = schedule_length(options)
         coarse = experiments.coarse_share
@@ -76,7 +83,8 @@ class Schedule:
             sh_interval=max(1, shrunk(experiments.sh_degree_interval, steps)),
             coarse_steps=int(coarse * steps),
             seen_share=seen_share,
-            dropout=dropout,
+            sh_degree=options.sh_degree if views is None else sh_degree_of(options, views),
+            dropout=0.0 if views is None else dropout_of(options, views),
         )
 
     def resolution_factor(self, step: int) -> int:
@@ -86,7 +94,7 @@ class Schedule:
         return COARSE_FACTORS[(step - 1) * len(COARSE_FACTORS) // self.coarse_steps]
 
     def sh_degree_at(self, step: int) -> int:
-        return min(self.options.sh_degree, step // self.sh_interval)
+        return min(self.sh_degree, step // self.sh_interval)
 
     def dropped_share_at(self, step: int) -> float:
         """The share of the Gaussians that is not drawn in a step: it rises linearly from 0."""

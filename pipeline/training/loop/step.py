@@ -28,7 +28,7 @@ class Step:
             the steps uses (``Schedule.camera_rate``), as a function of that share.
         measures_psnr: Whether the PSNR of the render is measured, which takes a pass over the
             image.
-        dropped_share: The share of the Gaussians that is not drawn (``training.dropout``).
+        dropped_share: The share of the Gaussians that is not drawn (``training.few_views``).
     """
 
     view: StepView

@@ -71,7 +71,7 @@ def train(
         # The overviews of a block may show only Gaussians of other blocks.
         if state.counters.blind_steps and inputs.open_layers is None:
             warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
-        return result_of(state, scene, run.options.sh_degree, warnings, backend.facts())
+        return result_of(state, scene, trainer.schedule.sh_degree, warnings, backend.facts())
 
 
 @contextmanager

@@ -14,7 +14,6 @@ from pipeline.training.data.targets import usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.density.strategy import DensityStep
-from pipeline.training.dropout import dropout_of
 from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.operator_step import OperatorStep
@@ -37,12 +36,12 @@ class Trainer:
         self, scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
     ) -> None:
         self.scene, self.state, self.run, self.backend = scene, state, run, backend
-        self.engine = make_engine(scene, state, run, backend)
+        views = None if run.is_part else len(scene.views)
+        self.schedule = Schedule.of(run.options, scene.inputs.seen_share, views)
+        self.engine = make_engine(scene, state, run, backend, self.schedule)
         self.floaters = floater_removal(scene, run)
         self.rate_unit = learning_rate_unit(scene.inputs, run.options)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, run.steps // CURVE_RECORDS))
-        share = dropout_of(run, len(scene.views))
-        self.schedule = Schedule.of(run.options, scene.inputs.seen_share, share)
         self.clock = Clock(run.steps, run.options.budget_minutes, run.span)
 
     def step(self) -> None:
@@ -204,11 +203,15 @@ class Trainer:
 
 
 def make_engine(
-    scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
+    scene: TrainingScene,
+    state: TrainState,
+    run: TrainingRun,
+    backend: Backend,
+    schedule: Schedule,
 ) -> StepEngine:
     """Steps on the backend's device, or by its operators if that is the CPU or if the strategy
     needs more in a step than devices do: losses of its own, noise or drop-out."""
-    operators = state.density.statistics is None or dropout_of(run, len(scene.views)) > 0
+    operators = state.density.statistics is None or schedule.dropout > 0
     training = None if operators else backend.resident()
     if training is None:
         return OperatorStep(scene, state, run, backend)

@@ -35,6 +35,8 @@ CASES = [
     Case(1, 700, (97, 53), RasterOptions(background=(0.2, 0.5, 0.9), threads=2)),
     Case(2, 500, (71, 50), RasterOptions(antialias=True, background=(0.0, 0.0, 0.0), threads=1)),
     Case(7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), threads=3)),
+    # Large ones, of which many reach behind the camera.
+    Case(4, 40, (45, 38), RasterOptions(threads=1), gaussian_size=1.0),
 ]
 
 

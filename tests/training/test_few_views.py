@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.settled import Train, TrainOptions
-from pipeline.training.dropout import DROPPED_LOGIT, FEW_VIEWS, SHARE, dropout_of, thinned
-from pipeline.training.run import Part, TrainingRun
+from pipeline.training.few_views import (
+    DROPPED_LOGIT,
+    FEW_VIEWS,
+    SHARE,
+    dropout_of,
+    few_views_lines,
+    sh_degree_of,
+    thinned,
+)
+from pipeline.training.loop.schedule import Schedule
 
 
 def rng() -> np.random.Generator:
@@ -41,12 +47,24 @@ def test_the_derivative_equals_finite_differences() -> None:
     assert torch.isfinite(found.logits).all()
 
 
-def test_only_few_training_views_drop_gaussians() -> None:
-    def share(views: int, part: Part | None = None, **experiments: float) -> float:
-        options = dict(Train()) | {"experiments": TrainExperiments(**experiments)}
-        parts = {} if part is None else {"part": part}
-        return dropout_of(TrainingRun(TrainOptions(**options), Path(), **parts), views)
+def options_of(**experiments: float) -> TrainOptions:
+    return TrainOptions(**dict(Train()) | {"experiments": TrainExperiments(**experiments)})
 
-    assert share(3) == share(FEW_VIEWS) == SHARE
-    assert share(FEW_VIEWS + 1) == share(FEW_VIEWS, Part(0, 0.5)) == 0
-    assert share(3, dropout=0.0) == 0 and share(100, dropout=0.5) == 0.5
+
+def test_only_few_training_views_drop_gaussians() -> None:
+    assert dropout_of(options_of(), 3) == dropout_of(options_of(), FEW_VIEWS) == SHARE
+    assert dropout_of(options_of(), FEW_VIEWS + 1) == 0
+    assert dropout_of(options_of(dropout=0.0), 3) == 0
+    assert dropout_of(options_of(dropout=0.5), 100) == 0.5
+    assert Schedule.of(options_of(), views=3).dropped_share_at(Train().steps) == SHARE
+    assert Schedule.of(options_of()).dropped_share_at(Train().steps) == 0  # A block.
+
+
+@pytest.mark.parametrize(("views", "degree"), [(3, 0), (4, 1), (8, 1), (9, 2), (15, 2), (16, 3)])
+def test_spherical_harmonics_have_no_more_coefficients_than_views(views: int, degree: int) -> None:
+    assert sh_degree_of(options_of(), views) == degree
+    assert Schedule.of(options_of(), views=views).sh_degree_at(Train().steps) == degree
+    assert sh_degree_of(options_of(views_per_sh_coefficient=0.0), views) == 3
+    assert any(
+        f"harmonics is {degree}" in line for line in few_views_lines(options_of(), views)
+    ) == (degree < 3)

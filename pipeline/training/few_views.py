@@ -42,10 +42,12 @@ class ThinnedOpacities:
 
 
 def dropout_of(options: TrainOptions, views: int) -> float:
-    """The share of the Gaussians that is dropped at the end of a run on so many ``views``."""
+    """The share of the Gaussians that is dropped at the end of a run on so many ``views``. While
+    cameras are refined, it is 0 unless it is configured: their gradients are less exact with it."""
     share = options.experiments.dropout
     if share is None:
-        share = SHARE if views <= FEW_VIEWS else 0.0
+        refined = options.refine_poses or options.refine_intrinsics
+        share = SHARE if views <= FEW_VIEWS and not refined else 0.0
     return share
 
 

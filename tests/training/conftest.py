@@ -46,6 +46,8 @@ def tiny_config(
         changes: other options of ``Train`` and ``TrainExperiments``.
     """
     values: dict[str, object] = {"steps": steps, "sh_degree": 1}
+    # The scene's six views would be few.
+    values |= {"dropout": 0.0, "views_per_sh_coefficient": 0.0}
     values |= {"sh_degree_interval": 2000, "coarse_share": 0.0} | changes
     control = {"start_step": 700, "interval": 1750, "stop_share": 0.7, "max_gaussians": 130}
     control |= density or {}  # type: ignore[arg-type]

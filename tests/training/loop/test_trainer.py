@@ -162,7 +162,7 @@ def test_killed_at_twenty_random_steps_and_resumed_gives_the_same_bytes(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str
 ) -> None:
     density = {"strategy": strategy, "max_gaussians": 90, "prune_opacity": 0.1}
-    config = tiny_config(60, density=density)
+    config = tiny_config(60, density=density, dropout=0.3)
     write_npz(tmp_path / "whole.npz", run(scene, tmp_path / "whole", config).gaussians)
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0.0)
     calls = np.random.default_rng(11).permutation(np.arange(1, 61))[:20]

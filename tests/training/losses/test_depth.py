@@ -129,6 +129,7 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
             means_final_learning_rate=0.02,
             means_learning_rate_unit="scene_scale",
             learning_rate_factor=1.0,
+            dropout=0.0,
         ),
     )
     result = train(

@@ -77,6 +77,7 @@ FLIPS = {
     "views.masks": Flip("ignore", POSED),
     "split.source": Flip("every", POSED, "split"),
     "split.test_every": Flip(5, POSED),
+    "split.train_views": Flip(4, POSED),
     **{
         f"decode.{name}": Flip(value, POSED, "raw")
         for name, value in (

@@ -29,6 +29,7 @@ ROOMS = {
     "training.cameras": "refinement of poses and intrinsics",
     "training.appearance": "exposure gains and appearance embeddings",
     "training.density": "density strategies, removal of floaters",
+    "training.few_views": "drop-out and fewer spherical harmonics for few photographs",
     "training.run": "the settings of a training: options, seed, threads, memory",
     "training.checkpoints": "files that resume a killed run",
     "training.loop": "the optimisation, step by step",

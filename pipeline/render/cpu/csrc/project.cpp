@@ -125,8 +125,8 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
     const PixelRange down = pixel_range(p.y, extent_y, view.height);
     const uint32_t all = (1u << kProjectLanes) - 1;
     s.dropped = (~bits(usable) | (bits(in_front) & ~bits(sound))) & all;
-    s.drawn = bits(usable & in_front & sound & ellipse & (reach > 0.0) & (across.first <= across.last) &
-                   (down.first <= down.last));
+    s.drawn = bits(usable & in_front & sound & ellipse & (reach > 0.0) &
+                   (across.first <= across.last) & (down.first <= down.last));
     return s;
 }
 

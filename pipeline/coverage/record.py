@@ -84,6 +84,45 @@ class FloaterCoverage(JsonObject):
     )
 
 
+class NovelKind(JsonObject):
+    """Means over the novel views of one kind; shares are of all pixels, 0 to 1."""
+
+    num_views: int = Field(ge=1, description="Number of novel views.")
+    contradicted_share: float = Field(
+        ge=0, le=1, description="Pixels that contradict the photographs: floaters, veils and haze."
+    )
+    unseen_share: float = Field(
+        ge=0, le=1, description="Other pixels, whose surface no training view sees."
+    )
+
+
+class NovelPlace(JsonObject):
+    """A novel view; world to camera in COLMAP's convention, in the scene's frame."""
+
+    kind: str = Field(description="The kind of the view.")
+    near: str = Field(description="The name of the training view that was moved.")
+    contradicted_share: float = Field(ge=0, le=1, description="Pixels, as in `by_kind`.")
+    unseen_share: float = Field(ge=0, le=1, description="Pixels, as in `by_kind`.")
+    world_to_camera: Matrix4 = Field(description="4 x 4 by rows.")
+    render: str = Field(description=f"{RENDER}.")
+    map: str = Field(
+        description="File of the dimmed render with contradicted pixels orange and unseen ones blue."
+    )
+
+
+class NovelViewCoverage(JsonObject):
+    """What views show that stand where no photograph does, compared with the photographs."""
+
+    contradicted_share: float = Field(ge=0, le=1, description="Mean over all novel views.")
+    unseen_share: float = Field(ge=0, le=1, description="Mean over all novel views.")
+    by_kind: dict[str, NovelKind] = Field(
+        description="`between` two cameras; `beside` a camera, by 0.3 of the distance to its "
+        "subject; `behind` it, by 0.35; `raised` by 0.3, looking at the same subject. Kinds "
+        "without a free place are left out."
+    )
+    worst: NovelPlace = Field(description="The view with most contradicted pixels.")
+
+
 class Surroundings(JsonObject):
     """Trust around the photographs, over viewpoints from which more could be taken."""
 
@@ -133,6 +172,9 @@ class CoverageRecord(JsonFile, JsonObject):
     )
     error: ErrorByTrust | None = Field(None, description="null with a `reason`.")
     floaters: FloaterCoverage | None = Field(None, description="null with a `reason`.")
+    novel_views: NovelViewCoverage | None = Field(
+        None, description="null with a `reason`, or if there is no free place beside the cameras."
+    )
     surroundings: Surroundings | None = Field(None, description="null with a `reason`.")
     viewpoints: tuple[ProposedViewpoint, ...] = Field(
         (), description="In the order in which they raise trust most."

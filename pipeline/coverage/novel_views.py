@@ -1,0 +1,154 @@
+"""Novel views: places beside the photographs where one may walk, at which no test view stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from pipeline.coverage.defects import MIN_AGREEING
+from pipeline.coverage.probe_views import Doubles
+from pipeline.coverage.summary import heading
+from pipeline.coverage.training_views import TrainingViews, evenly
+from pipeline.coverage.viewpoints import features, place_evidence, subject_distance
+from pipeline.geometry.rotations import quat_to_rotation, rotation_from_vector, rotation_to_quat
+from pipeline.scene.views import View
+
+Kind = Literal["between", "beside", "behind", "raised"]
+#: Halfway to the nearest camera; to one side; backwards; upwards, looking at the same subject.
+KINDS: tuple[Kind, ...] = get_args(Kind)
+#: Number of cameras that are moved, evenly spaced; each gives up to one novel view of each kind.
+MAX_CAMERAS = 6
+#: Moves, in shares of the distance from the camera to its subject.
+BESIDE, BEHIND, RAISED = 0.3, 0.35, 0.3
+#: Cameras whose viewing directions differ by more than acos(this) are not neighbours.
+NEIGHBOUR_COSINE = 0.5
+#: Places that no photograph shows are at most this far from a camera, in the same unit.
+REACH = 0.4
+#: Places are at least this far from the surface that training views show, in the same unit, or
+#: half as far as the camera itself: surfaces go on a little beyond the photographs, and one does
+#: not look at a wall from inside.
+CLEARANCE = 0.2
+
+
+@dataclass(frozen=True)
+class NovelView:
+    """A camera without a photograph, near a training view.
+
+    Attributes:
+        kind: How it was moved.
+        base: The training view.
+        view: The moved camera. Its name and files are those of the training view.
+        distance: The distance from the training view to its subject, world units.
+    """
+
+    kind: Kind
+    base: View
+    view: View
+    distance: float
+
+
+def choose_novel_views(training: TrainingViews, up: Doubles) -> list[NovelView]:
+    """Novel views around up to ``MAX_CAMERAS`` cameras, at free places; ordered by camera.
+
+    Args:
+        up: (3,) up vector of the world.
+    """
+    candidates = list(_candidates(training, up))
+    free = _free(candidates, training)
+    chosen: dict[tuple[int, Kind], NovelView] = {}
+    for (base, novel), is_free in zip(candidates, free, strict=True):
+        if is_free:
+            chosen.setdefault((base, novel.kind), novel)
+    return list(chosen.values())
+
+
+def _candidates(training: TrainingViews, up: Doubles) -> Iterator[tuple[int, NovelView]]:
+    """Novel views by camera and kind, with that to be preferred first: left and right alternate."""
+    distances = np.array([subject_distance(probe) for probe in training.probes])
+    if not (distances > 0).any():
+        return
+    scale = float(np.median(distances[distances > 0]))
+    described = np.stack([features(view, scale) for view in training.views])
+    pairs: set[frozenset[int]] = set()
+    usable = [i for i, distance in enumerate(distances) if distance > 0]
+    for number, i in enumerate(evenly(usable, MAX_CAMERAS)):
+        view, distance = training.views[i], float(distances[i])
+        rotation, centre = view.world_to_camera[:3, :3], view.centre
+        right, ahead = heading(view, up)
+        j = _neighbour(described, i)
+        moved: list[tuple[Kind, View]] = []
+        if j is not None and {i, j} not in pairs:
+            pairs.add(frozenset((i, j)))
+            moved.append(("between", _halfway(view, training.views[j])))
+        for side in (1, -1) if number % 2 == 0 else (-1, 1):
+            beside = centre + side * BESIDE * distance * right
+            moved.append(("beside", _posed(view, rotation, beside)))
+        moved.append(("behind", _posed(view, rotation, centre - BEHIND * distance * ahead)))
+        moved.append(("raised", _raised(view, distance, up)))
+        for kind, novel in moved:
+            yield number, NovelView(kind, view, novel, distance)
+
+
+def _free(candidates: Sequence[tuple[int, NovelView]], training: TrainingViews) -> list[bool]:
+    """Whether one can stand at each place: a photograph sees a surface behind it, or a camera is
+    near and no photograph has a surface in front of it; and no surface is close."""
+    if not candidates:
+        return []
+    places = np.stack([novel.view.centre for _, novel in candidates])
+    distance = np.array([novel.distance for _, novel in candidates])
+    free, unseen = place_evidence(places, REACH * distance, training.probes)
+    sample = training.surface
+    # What two views see past is no surface, although another one shows it.
+    surface = sample.xyz[sample.seen_past < MIN_AGREEING]
+
+    def is_clear(novel: NovelView) -> bool:
+        own, moved = (_clearance(view.centre, surface) for view in (novel.base, novel.view))
+        return moved > min(CLEARANCE * novel.distance, own / 2)
+
+    clear = [is_clear(novel) for _, novel in candidates]
+    return [bool(value) for value in (free | unseen) & clear]
+
+
+def _clearance(place: Doubles, surface: Doubles) -> float:
+    """The distance of a place from the nearest of (N, 3) points."""
+    return float(np.sqrt(((surface - place) ** 2).sum(axis=1).min(initial=np.inf)))
+
+
+def _neighbour(described: Doubles, i: int) -> int | None:
+    """The camera nearest to camera ``i`` in place and direction, None without one."""
+    distance = np.linalg.norm(described - described[i], axis=1)
+    distance[described[:, 3:] @ described[i, 3:] < NEIGHBOUR_COSINE] = np.inf
+    distance[i] = np.inf
+    best = int(distance.argmin())
+    return best if np.isfinite(distance[best]) else None
+
+
+def _halfway(view: View, other: View) -> View:
+    """The view halfway to another one: the mean place, and the rotation by spherical linear
+    interpolation, which is the normalised mean of the quaternions."""
+    a, b = (rotation_to_quat(v.world_to_camera[:3, :3]) for v in (view, other))
+    rotation = quat_to_rotation(a + b if a @ b >= 0 else a - b)
+    return _posed(view, rotation, (view.centre + other.centre) / 2)
+
+
+def _raised(view: View, distance: float, up: Doubles) -> View:
+    """The view moved up, turned so that its optical axis meets the same subject."""
+    rotation = view.world_to_camera[:3, :3]
+    centre = view.centre + RAISED * distance * up
+    ahead = view.centre + distance * rotation[2] - centre
+    ahead /= np.linalg.norm(ahead)
+    axis = np.cross(rotation[2], ahead)
+    sine = float(np.linalg.norm(axis))
+    if sine > 1e-9:
+        angle = float(np.arctan2(sine, rotation[2] @ ahead))
+        rotation = rotation @ rotation_from_vector(axis / sine * angle).T
+    return _posed(view, rotation, centre)
+
+
+def _posed(view: View, rotation: Doubles, centre: Doubles) -> View:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return replace(view, mask=None, world_to_camera=pose)

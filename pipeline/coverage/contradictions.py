@@ -2,25 +2,27 @@
 
 A pixel of a novel view is contradicted if
 
-- it shows a surface that fewer than two training views see, and that two of them see past, or that
-  is nearer than half the distance of the nearest surface in view on which two agree (a floater); or
-- it shows a surface that training views see, in a colour that none of their photographs has there
-  (a veil or haze, which is too transparent to be the surface itself).
+- it shows something nearer than half the distance of the nearest surface in view on which two
+  training views agree, and fewer than two see it: a surface, or a veil, without which the pixel's
+  colour would be another one;
+- it shows a surface that fewer than two training views see and that two see past; or
+- it shows a surface that training views see, in a colour that none of their photographs has there.
 
 A pixel whose surface no training view sees is unseen: nothing is known of what belongs there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.coverage.defects import MIN_AGREEING, NEAR_SHARE
+from pipeline.coverage.novel_views import KINDS, Kind, NovelView, choose_novel_views
 from pipeline.coverage.probe_views import (
     Bools,
     Doubles,
@@ -31,19 +33,43 @@ from pipeline.coverage.probe_views import (
     find_visible,
     neighbourhood,
     project,
+    render_probes,
 )
 from pipeline.coverage.training_views import TrainingViews
 from pipeline.photos.load import load_view, resize_area
-from pipeline.render import Color
+from pipeline.render import BACKGROUNDS, Color
+from pipeline.render.views import Render, to_bytes
+from pipeline.runtime.progress import track
 from pipeline.scene.views import View
+
+#: Renders a view without the Gaussians up to a camera z, world units; 0 for all.
+NearRenderer = Callable[[View, float], Render]
+Picture = NDArray[np.uint8]
 
 #: Number of photographs, those that see most of a novel view, whose colours are compared.
 MAX_PHOTOGRAPHS = 4
-#: Difference of colours in [0, 1], in the channel that differs most, that contradicts a photograph.
+#: Difference of colours in [0, 1], in the channel that differs most, that counts.
 MIN_DIFFERENCE = 0.1
 #: Bounds of the gain by which a photograph is multiplied to match its render's exposure.
 GAINS = 0.5, 2.0
+#: Stride of the compared pixels, in both directions.
+PIXEL_STEP = 2
 CONTRADICTED_COLOUR, UNSEEN_COLOUR = (255, 150, 0), (45, 65, 140)
+
+
+@dataclass(frozen=True)
+class NovelProbe:
+    """A novel view, rendered.
+
+    Attributes:
+        near: Half the distance of the nearest surface in view on which two training views agree,
+            world units; 0 if there is none.
+        beyond: (H, W, 3) the render without the Gaussians up to ``near``.
+    """
+
+    probe: ProbeView
+    near: float
+    beyond: Picture
 
 
 @dataclass(frozen=True)
@@ -83,37 +109,92 @@ class _Evidence:
     photographs: Sequence[int]
 
 
-def find_contradictions(
-    shown: Sequence[ProbeView],
+@dataclass(frozen=True)
+class NovelViews:
+    """The novel views of a scene, compared with its photographs.
+
+    Attributes:
+        views: The novel views.
+        probes: Their renders, in the same order.
+        shares: (N, 2) shares of contradicted and of unseen pixels.
+    """
+
+    views: Sequence[NovelView]
+    probes: Sequence[NovelProbe]
+    shares: Doubles
+
+    def by_kind(self) -> dict[Kind, tuple[int, Doubles]]:
+        """The number of views of each kind that has one, and their mean shares."""
+        kinds = {kind: [view.kind == kind for view in self.views] for kind in KINDS}
+        return {
+            kind: (sum(which), self.shares[which].mean(axis=0))
+            for kind, which in kinds.items()
+            if any(which)
+        }
+
+
+def compare_novel_views(
     training: TrainingViews,
-    background: Color,
+    up: Doubles,
+    render: NearRenderer,
+    background: Color | None,
+    threads: int,
+) -> NovelViews | None:
+    """Choose novel views and compare them with the photographs; None if there is no free place.
+
+    Args:
+        up, background, threads: See ``choose_novel_views`` and ``find_contradictions``.
+    """
+    novel = choose_novel_views(training, up)
+    rendered = render_novel_views([item.view for item in novel], training, render)
+    shown = list(track(rendered, "rendering novel views", len(novel), unit="views"))
+    found = find_contradictions(shown, training, background, threads, PIXEL_STEP)
+    shares = [(item.contradicted.mean(), item.unseen.mean()) for item in found]
+    return NovelViews(novel, shown, np.array(shares)) if novel else None
+
+
+def render_novel_views(
+    views: Sequence[View], training: TrainingViews, render: NearRenderer
+) -> Iterator[NovelProbe]:
+    """Render views at reduced size, one at a time."""
+    agreed = training.surface.agreed(MIN_AGREEING)
+    for probe in render_probes(views, lambda view: render(view, 0.0)):
+        inside, _, z = project(probe.view, agreed)
+        # The 2nd percentile of the points inside the image, whether or not something hides them.
+        near = NEAR_SHARE * float(np.percentile(z[inside], 2)) if len(inside) else 0.0
+        beyond = to_bytes(render(probe.view, near).rgb) if near else probe.rgb
+        yield NovelProbe(probe, near, beyond)
+
+
+def find_contradictions(
+    shown: Sequence[NovelProbe],
+    training: TrainingViews,
+    background: Color | None,
     threads: int,
     step: int = 1,
 ) -> list[Contradictions]:
     """Compare novel views with the training views and their photographs.
 
     Args:
-        shown: The novel views.
-        background: The colour behind photographs with an alpha channel.
+        background: The colour behind photographs with an alpha channel; None for black.
         threads: The number of views at a time, which does not affect results.
         step: The stride of the compared pixels.
     """
-    agreed = training.surface.agreed(MIN_AGREEING)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        found = list(pool.map(lambda probe: _evidence(probe, training, step), shown))
+        found = list(pool.map(lambda novel: _evidence(novel.probe, training, step), shown))
         needed = sorted({i for evidence in found for i in evidence.photographs})
         ranges = pool.map(
             lambda i: _colour_range(training.views[i], training.probes[i], background), needed
         )
         colours = dict(zip(needed, ranges, strict=True))
 
-        def judge(probe: ProbeView, evidence: _Evidence) -> Contradictions:
-            return _judge(probe, evidence, training, agreed, colours, step)
+        def judge(novel: NovelProbe, evidence: _Evidence) -> Contradictions:
+            return _judge(novel, evidence, training, colours, step)
 
         return list(pool.map(judge, shown, found))
 
 
-def contradiction_map(probe: ProbeView, found: Contradictions) -> NDArray[np.uint8]:
+def contradiction_map(probe: ProbeView, found: Contradictions) -> Picture:
     """(H, W, 3) the render, dimmed, with contradicted pixels orange and unseen ones blue.
 
     Args:
@@ -138,11 +219,11 @@ def _evidence(probe: ProbeView, training: TrainingViews, step: int) -> _Evidence
     return _Evidence(points, count, seen_past, [int(i) for i in most if overlap[i]])
 
 
-def _colour_range(view: View, probe: ProbeView, background: Color) -> ColourRange:
+def _colour_range(view: View, probe: ProbeView, background: Color | None) -> ColourRange:
     """The colours of a photograph. One gain a channel, by least squares, makes it match the render
     of the training view, whose exposure may be another."""
     height, width = probe.depth.shape
-    pixels = resize_area(load_view(view).over(background), width, height)
+    pixels = resize_area(load_view(view).over(background or BACKGROUNDS["black"]), width, height)
     photograph, render = (values.astype(np.float32) / 255 for values in (pixels, probe.rgb))
     p, r = (values[probe.valid] for values in (photograph, render))
     square = (p * p).sum(axis=0)
@@ -154,39 +235,31 @@ def _colour_range(view: View, probe: ProbeView, background: Color) -> ColourRang
 
 
 def _judge(
-    probe: ProbeView,
+    novel: NovelProbe,
     evidence: _Evidence,
     training: TrainingViews,
-    agreed: Doubles,
     colours: dict[int, ColourRange],
     step: int,
 ) -> Contradictions:
     points = evidence.points
     sampled = slice(step // 2, None, step)
-    depth, smooth = (values[sampled, sampled] for values in (probe.depth, _mean_colours(probe.rgb)))
-    shape, shown = depth.shape, smooth.reshape(-1, 3)
-    difference = np.full(len(points), np.inf, np.float32)
+    rgb, beyond = (
+        np.add.reduce(neighbourhood(picture.astype(np.float32)))[sampled, sampled] / (9 * 255)
+        for picture in (novel.probe.rgb, novel.beyond)
+    )
+    depth = novel.probe.depth[sampled, sampled]
+    few = (evidence.count < MIN_AGREEING).reshape(depth.shape)
+    seen_past = ((evidence.seen_past >= MIN_AGREEING) & ~points.empty).reshape(depth.shape)
+    veiled = np.abs(rgb - beyond).max(axis=2) > MIN_DIFFERENCE
+    floating = few & seen_past | np.where(depth < novel.near, few, veiled)
+    difference, shown = np.full(len(points), np.inf, np.float32), rgb.reshape(-1, 3)
     for i in evidence.photographs:
         visibility = find_visible(training.probes[i], points.xyz, points.empty)
-        seen, (low, high) = visibility.visible, colours[i]
-        low, high, colour = low[visibility.pixel], high[visibility.pixel], shown[seen]
-        outside = np.maximum(np.maximum(low - colour, colour - high), 0).max(axis=1)
+        seen, pixel = visibility.visible, visibility.pixel
+        below, above = colours[i].low[pixel] - shown[seen], shown[seen] - colours[i].high[pixel]
+        outside = np.maximum(np.maximum(below, above), 0).max(axis=1)
         difference[seen] = np.minimum(difference[seen], outside)
-    veiled = np.isfinite(difference) & (difference > MIN_DIFFERENCE)
-    near = depth.ravel() < NEAR_SHARE * _nearest(probe, agreed)
-    few = ~points.empty & (evidence.count < MIN_AGREEING)
-    contradicted = veiled | (few & (near | (evidence.seen_past >= MIN_AGREEING)))
-    unseen = (evidence.count == 0) & ~contradicted
-    return Contradictions(contradicted.reshape(shape), unseen.reshape(shape))
-
-
-def _mean_colours(rgb: NDArray[np.uint8]) -> NDArray[Any]:
-    """(H, W, 3) float32 means in [0, 1] over the 3 x 3 neighbourhoods."""
-    return np.add.reduce(neighbourhood(rgb.astype(np.float32))) / np.float32(9 * 255)
-
-
-def _nearest(probe: ProbeView, agreed: Doubles) -> float:
-    """The distance of the nearest points (2nd percentile) inside the image, whether or not
-    something hides them; 0 without points."""
-    inside, _, z = project(probe.view, agreed)
-    return float(np.percentile(z[inside], 2)) if len(inside) else 0.0
+    wrong = np.isfinite(difference) & (difference > MIN_DIFFERENCE)
+    contradicted = floating | wrong.reshape(depth.shape)
+    unseen = (evidence.count == 0).reshape(depth.shape) & ~contradicted
+    return Contradictions(contradicted, unseen)

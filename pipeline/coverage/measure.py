@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.coverage.contradictions import contradiction_map, find_contradictions
+from pipeline.coverage.contradictions import (
+    NearRenderer,
+    compare_novel_views,
+    contradiction_map,
+    find_contradictions,
+)
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.novel_views import KINDS, choose_novel_views
 from pipeline.coverage.probe_views import (
     Bools,
     Doubles,
@@ -65,8 +69,6 @@ from pipeline.splats.gaussians import Gaussians
 MAX_TEST_VIEWS = 12
 #: Number of test views, those of least trust, whose images are written.
 SHOWN = 2
-#: Stride of the pixels of novel views that are compared with the photographs.
-NOVEL_STEP = 2
 #: Error and trust are averaged over square blocks of the maps; side in pixels.
 BLOCK = 8
 #: The rank correlation is not computed for fewer blocks.
@@ -161,8 +163,8 @@ def measure_coverage(
     """
     threads = options.threads
 
-    def render(view: View) -> Render:
-        return render_view(gaussians, view, options)
+    def render(view: View, near: float = 0.0) -> Render:
+        return render_view(gaussians, view, replace(options, near=max(near, options.near)))
 
     num_training = sum(not view.is_test for view in views)
     record = CoverageRecord(
@@ -371,39 +373,34 @@ def _proposals(
 def _novel_views(
     out: Path,
     training: TrainingViews,
-    render: Renderer,
+    render: NearRenderer,
     options: RasterOptions,
     world: WorldFrame,
 ) -> NovelViewCoverage | None:
     """The novel views, with the images of the worst one written; None without any."""
-    novel = choose_novel_views(training, world.up)
-    if not novel:
-        return None
-    rendered = render_probes([item.view for item in novel], render)
-    shown = list(track(rendered, "rendering novel views", len(novel), unit="views"))
     background, threads = options.background, options.threads
-    found = find_contradictions(shown, training, background, threads, NOVEL_STEP)
-    shares = np.array([(item.contradicted.mean(), item.unseen.mean()) for item in found])
-    worst = int(shares[:, 0].argmax())
-    (whole,) = find_contradictions([shown[worst]], training, background, threads)
+    found = compare_novel_views(training, world.up, render, background, threads)
+    if found is None:
+        return None
+    worst = int(found.shares[:, 0].argmax())
+    novel, shown = found.views[worst], found.probes[worst]
+    (contradictions,) = find_contradictions([shown], training, background, threads)
     names = "coverage/novel_render.png", "coverage/novel_map.png"
-    _write_pngs(out, names, (shown[worst].rgb, contradiction_map(shown[worst], whole)))
-    kinds = {kind: [item.kind == kind for item in novel] for kind in KINDS}
-    by_kind = {
-        kind: NovelKind(num_views=sum(which), **_shares(shares[which].mean(axis=0)))
-        for kind, which in kinds.items()
-        if any(which)
+    _write_pngs(out, names, (shown.probe.rgb, contradiction_map(shown.probe, contradictions)))
+    by_kind: dict[str, NovelKind] = {
+        kind: NovelKind(num_views=number, **_shares(shares))
+        for kind, (number, shares) in found.by_kind().items()
     }
-    view = world.normalization.view_to_given(novel[worst].view)
+    view = world.normalization.view_to_given(novel.view)
     place = NovelPlace(
-        kind=novel[worst].kind,
-        near=novel[worst].base.name,
-        **_shares(shares[worst]),
+        kind=novel.kind,
+        near=novel.base.name,
+        **_shares(found.shares[worst]),
         world_to_camera=_rounded(view.world_to_camera, 9 + world.digits),
         render=names[0],
         map=names[1],
     )
-    return NovelViewCoverage(**_shares(shares.mean(axis=0)), by_kind=by_kind, worst=place)
+    return NovelViewCoverage(**_shares(found.shares.mean(axis=0)), by_kind=by_kind, worst=place)
 
 
 def _shares(values: Doubles) -> dict[str, Any]:

@@ -106,7 +106,7 @@ class NovelPlace(JsonObject):
     world_to_camera: Matrix4 = Field(description="4 x 4 by rows.")
     render: str = Field(description=f"{RENDER}.")
     map: str = Field(
-        description="File of the dimmed render with contradicted pixels orange and unseen ones blue."
+        description="File of the render, dimmed, with contradicted pixels orange, unseen ones blue."
     )
 
 

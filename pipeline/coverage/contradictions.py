@@ -13,9 +13,9 @@ A pixel whose surface no training view sees is unseen: nothing is known of what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -34,16 +34,16 @@ from pipeline.coverage.probe_views import (
     neighbourhood,
     project,
     render_probes,
+    rotate,
 )
 from pipeline.coverage.training_views import TrainingViews
 from pipeline.photos.load import load_view, resize_area
-from pipeline.render import BACKGROUNDS, Color
-from pipeline.render.views import Render, to_bytes
+from pipeline.render import BACKGROUNDS, Color, RasterOptions
+from pipeline.render.views import render_view, to_bytes
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
 
-#: Renders a view without the Gaussians up to a camera z, world units; 0 for all.
-NearRenderer = Callable[[View, float], Render]
 Picture = NDArray[np.uint8]
 
 #: Number of photographs, those that see most of a novel view, whose colours are compared.
@@ -136,34 +136,45 @@ class NovelViews:
 def compare_novel_views(
     training: TrainingViews,
     up: Doubles,
-    render: NearRenderer,
-    background: Color | None,
-    threads: int,
+    gaussians: Gaussians,
+    options: RasterOptions,
 ) -> NovelViews | None:
     """Choose novel views and compare them with the photographs; None if there is no free place.
 
     Args:
-        up, background, threads: See ``choose_novel_views`` and ``find_contradictions``.
+        up: (3,) up vector of the world.
+        options: How views are rendered. The number of threads does not affect results.
     """
     novel = choose_novel_views(training, up)
-    rendered = render_novel_views([item.view for item in novel], training, render)
+    rendered = render_novel_views([item.view for item in novel], training, gaussians, options)
     shown = list(track(rendered, "rendering novel views", len(novel), unit="views"))
-    found = find_contradictions(shown, training, background, threads, PIXEL_STEP)
+    found = find_contradictions(shown, training, options.background, options.threads, PIXEL_STEP)
     shares = [(item.contradicted.mean(), item.unseen.mean()) for item in found]
     return NovelViews(novel, shown, np.array(shares)) if novel else None
 
 
 def render_novel_views(
-    views: Sequence[View], training: TrainingViews, render: NearRenderer
+    views: Sequence[View], training: TrainingViews, gaussians: Gaussians, options: RasterOptions
 ) -> Iterator[NovelProbe]:
     """Render views at reduced size, one at a time."""
-    agreed = training.surface.agreed(MIN_AGREEING)
-    for probe in render_probes(views, lambda view: render(view, 0.0)):
+    agreed, means = training.surface.agreed(MIN_AGREEING), gaussians.arrays()["means"]
+    for probe in render_probes(views, lambda view: render_view(gaussians, view, options)):
         inside, _, z = project(probe.view, agreed)
         # The 2nd percentile of the points inside the image, whether or not something hides them.
         near = NEAR_SHARE * float(np.percentile(z[inside], 2)) if len(inside) else 0.0
-        beyond = to_bytes(render(probe.view, near).rgb) if near else probe.rgb
+        beyond = probe.rgb
+        if _any_near(probe.view, means, near):
+            farther = replace(options, near=max(near, options.near))
+            beyond = to_bytes(render_view(gaussians, probe.view, farther).rgb)
         yield NovelProbe(probe, near, beyond)
+
+
+def _any_near(view: View, means: Floats, near: float) -> bool:
+    """Whether a point has a camera z between 0 and ``near``, up to 60 degrees from the axis."""
+    offset = means - view.centre.astype(np.float32)
+    z = rotate(offset, view.world_to_camera[2:3, :3].astype(np.float32))[:, 0]
+    close = (z > 0) & (z < near)
+    return bool(((offset[close] ** 2).sum(axis=1) < 4 * z[close] ** 2).any())
 
 
 def find_contradictions(

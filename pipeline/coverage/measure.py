@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.coverage.contradictions import (
-    NearRenderer,
     compare_novel_views,
     contradiction_map,
     find_contradictions,
@@ -163,8 +162,8 @@ def measure_coverage(
     """
     threads = options.threads
 
-    def render(view: View, near: float = 0.0) -> Render:
-        return render_view(gaussians, view, replace(options, near=max(near, options.near)))
+    def render(view: View) -> Render:
+        return render_view(gaussians, view, options)
 
     num_training = sum(not view.is_test for view in views)
     record = CoverageRecord(
@@ -205,7 +204,7 @@ def measure_coverage(
                 search_distance=floaters.within / world.normalization.scale,
                 by_camera=floaters.cameras,
             ),
-            "novel_views": _novel_views(out, training, render, options, world),
+            "novel_views": _novel_views(out, training, gaussians, options, world),
             "surroundings": Surroundings(
                 num_viewpoints=len(best.candidates),
                 mean_trust=best.trust_before,
@@ -373,13 +372,13 @@ def _proposals(
 def _novel_views(
     out: Path,
     training: TrainingViews,
-    render: NearRenderer,
+    gaussians: Gaussians,
     options: RasterOptions,
     world: WorldFrame,
 ) -> NovelViewCoverage | None:
     """The novel views, with the images of the worst one written; None without any."""
     background, threads = options.background, options.threads
-    found = compare_novel_views(training, world.up, render, background, threads)
+    found = compare_novel_views(training, world.up, gaussians, options)
     if found is None:
         return None
     worst = int(found.shares[:, 0].argmax())

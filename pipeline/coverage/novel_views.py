@@ -8,10 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from pipeline.coverage.defects import MIN_AGREEING
-from pipeline.coverage.probe_views import Doubles
+from pipeline.coverage.defects import MIN_AGREEING, NEAR_SHARE
+from pipeline.coverage.probe_views import Bools, Doubles
 from pipeline.coverage.summary import heading
-from pipeline.coverage.training_views import TrainingViews, evenly
+from pipeline.coverage.training_views import SurfaceSample, TrainingViews, evenly
 from pipeline.coverage.viewpoints import features, place_evidence, subject_distance
 from pipeline.geometry.rotations import quat_to_rotation, rotation_from_vector, rotation_to_quat
 from pipeline.scene.views import View
@@ -100,9 +100,7 @@ def _free(candidates: Sequence[tuple[int, NovelView]], training: TrainingViews) 
     places = np.stack([novel.view.centre for _, novel in candidates])
     distance = np.array([novel.distance for _, novel in candidates])
     free, unseen = place_evidence(places, REACH * distance, training.probes)
-    sample = training.surface
-    # What two views see past is no surface, although another one shows it.
-    surface = sample.xyz[sample.seen_past < MIN_AGREEING]
+    surface = training.surface.xyz[_is_surface(training.surface)]
 
     def is_clear(novel: NovelView) -> bool:
         own, moved = (_clearance(view.centre, surface) for view in (novel.base, novel.view))
@@ -110,6 +108,13 @@ def _free(candidates: Sequence[tuple[int, NovelView]], training: TrainingViews) 
 
     clear = [is_clear(novel) for _, novel in candidates]
     return [bool(value) for value in (free | unseen) & clear]
+
+
+def _is_surface(sample: SurfaceSample) -> Bools:
+    """(N,) False for floaters: points that two views see past, or that one view alone shows, nearer
+    than half the distance of the nearest surface."""
+    agreed = (sample.count >= MIN_AGREEING) | (sample.depth >= NEAR_SHARE * sample.nearest)
+    return np.asarray(agreed & (sample.seen_past < MIN_AGREEING))
 
 
 def _clearance(place: Doubles, surface: Doubles) -> float:

@@ -12,6 +12,9 @@ from pipeline.runtime.text import counted
 RENDER = "File of the render, relative to the stage's folder"
 TRUST_MAP = "File of the trust of each pixel: grey, 0 to 255 for 0 to 1"
 
+#: Share of contradicted pixels of novel views from which it is part of the summaries.
+CONSPICUOUS_SHARE = 0.05
+
 
 class SeenBy(JsonObject):
     """Shares of the surface, 0 to 1, by the number of training views that see it."""
@@ -122,6 +125,11 @@ class NovelViewCoverage(JsonObject):
     )
     worst: NovelPlace = Field(description="The view with most contradicted pixels.")
 
+    @property
+    def is_conspicuous(self) -> bool:
+        """Whether the contradictions are worth a word where few figures are shown."""
+        return self.contradicted_share >= CONSPICUOUS_SHARE
+
 
 class Surroundings(JsonObject):
     """Trust around the photographs, over viewpoints from which more could be taken."""
@@ -184,4 +192,8 @@ class CoverageRecord(JsonFile, JsonObject):
         """What was found, in a few words for the terminal."""
         if self.surface is None:
             return self.reason
-        return f"{counted(len(self.viewpoints), 'place')} to photograph next"
+        places = f"{counted(len(self.viewpoints), 'place')} to photograph next"
+        if self.novel_views is None or not self.novel_views.is_conspicuous:
+            return places
+        percent = f"{100 * self.novel_views.contradicted_share:.0f} %"
+        return f"{places}; {percent} of what one sees beside the photographs contradicts them"

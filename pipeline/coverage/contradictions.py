@@ -4,8 +4,7 @@ A pixel of a novel view is contradicted if
 
 - it shows something nearer than half the distance of the nearest surface in view on which two
   training views agree, and fewer than two see it: a surface, or a veil, without which the pixel's
-  colour would be another one;
-- it shows a surface that fewer than two training views see and that two see past; or
+  colour would be another one; or
 - it shows a surface that training views see, in a colour that none of their photographs has there.
 
 A pixel whose surface no training view sees is unseen: nothing is known of what belongs there.
@@ -98,14 +97,13 @@ class _Evidence:
     """How the training views see the points of a novel view.
 
     Attributes:
-        count, seen_past: (N,) see ``Observations``.
+        count: (N,) number of training views that see the point.
         photographs: Indices of the training views that see most of the points, at most
             ``MAX_PHOTOGRAPHS``.
     """
 
     points: QueryPoints
     count: NDArray[np.intp]
-    seen_past: NDArray[np.intp]
     photographs: Sequence[int]
 
 
@@ -193,11 +191,11 @@ def find_contradictions(
     """
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         found = list(pool.map(lambda novel: _evidence(novel.probe, training, step), shown))
-        needed = sorted({i for evidence in found for i in evidence.photographs})
-        ranges = pool.map(
-            lambda i: _colour_range(training.views[i], training.probes[i], background), needed
-        )
-        colours = dict(zip(needed, ranges, strict=True))
+        # One at a time, since each takes memory for a photograph at full size.
+        colours = {
+            i: _colour_range(training.views[i], training.probes[i], background)
+            for i in sorted({i for evidence in found for i in evidence.photographs})
+        }
 
         def judge(novel: NovelProbe, evidence: _Evidence) -> Contradictions:
             return _judge(novel, evidence, training, colours, step)
@@ -219,15 +217,14 @@ def contradiction_map(probe: ProbeView, found: Contradictions) -> Picture:
 
 def _evidence(probe: ProbeView, training: TrainingViews, step: int) -> _Evidence:
     points = backproject(probe, training.background_depth, step)
-    count, seen_past = np.zeros((2, len(points)), np.intp)
+    count = np.zeros(len(points), np.intp)
     overlap = []
     for photograph in training.probes:
         visibility = find_visible(photograph, points.xyz, points.empty)
         count[visibility.visible] += 1
-        seen_past += visibility.seen_past
         overlap.append(len(visibility.visible))
     most = np.argsort(-np.array(overlap), kind="stable")[:MAX_PHOTOGRAPHS]
-    return _Evidence(points, count, seen_past, [int(i) for i in most if overlap[i]])
+    return _Evidence(points, count, [int(i) for i in most if overlap[i]])
 
 
 def _colour_range(view: View, probe: ProbeView, background: Color | None) -> ColourRange:
@@ -260,9 +257,8 @@ def _judge(
     )
     depth = novel.probe.depth[sampled, sampled]
     few = (evidence.count < MIN_AGREEING).reshape(depth.shape)
-    seen_past = ((evidence.seen_past >= MIN_AGREEING) & ~points.empty).reshape(depth.shape)
     veiled = np.abs(rgb - beyond).max(axis=2) > MIN_DIFFERENCE
-    floating = few & seen_past | np.where(depth < novel.near, few, veiled)
+    floating = np.where(depth < novel.near, few, veiled)
     difference, shown = np.full(len(points), np.inf, np.float32), rgb.reshape(-1, 3)
     for i in evidence.photographs:
         visibility = find_visible(training.probes[i], points.xyz, points.empty)

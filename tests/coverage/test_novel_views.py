@@ -132,10 +132,11 @@ def test_the_scene_without_defects_agrees_with_its_photographs(world: World) -> 
     assert beside[1] > 0.02, "what no photograph shows is unseen"
 
 
-@pytest.mark.parametrize("plant", [veil, cloud, haze])
+@pytest.mark.parametrize(("plant", "least"), [(veil, 0.4), (cloud, 0.4), (haze, 0.2)])
 def test_planted_defects_are_contradicted(
-    world: World, plant: Callable[[World, NovelView], Gaussians]
+    world: World, plant: Callable[[World, NovelView], Gaussians], least: float
 ) -> None:
+    """In a part of the view that they take up, which no rule finds but the one that is for them."""
     novel, before = next(
         (novel, float(share))
         for novel, (share, _) in zip(world.clean.views, world.clean.shares, strict=True)
@@ -147,7 +148,7 @@ def test_planted_defects_are_contradicted(
         for other, (share, _) in zip(found.views, found.shares, strict=True)
         if other.kind == "beside" and other.base is novel.base
     )
-    assert before < 0.02 and after > 0.2
+    assert before < 0.02 and after > least
     assert found.shares[:, 0].mean() > 5 * world.clean.shares[:, 0].mean()
 
 

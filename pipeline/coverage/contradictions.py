@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,8 @@ MAX_PHOTOGRAPHS = 4
 MIN_DIFFERENCE = 0.1
 #: Bounds of the gain by which a photograph is multiplied to match its render's exposure.
 GAINS = 0.5, 2.0
+#: A photograph that differs from its render in more than this share of pixels is in another light.
+MAX_OUTSIDE = 0.5
 #: Stride of the compared pixels, in both directions.
 PIXEL_STEP = 2
 CONTRADICTED_COLOUR, UNSEEN_COLOUR = (255, 150, 0), (45, 65, 140)
@@ -229,17 +231,35 @@ def _evidence(probe: ProbeView, training: TrainingViews, step: int) -> _Evidence
 
 def _colour_range(view: View, probe: ProbeView, background: Color | None) -> ColourRange:
     """The colours of a photograph. One gain a channel, by least squares, makes it match the render
-    of the training view, whose exposure may be another."""
+    of the training view, whose exposure may be another. A photograph in another light is replaced
+    by the render."""
     height, width = probe.depth.shape
     pixels = resize_area(load_view(view).over(background or BACKGROUNDS["black"]), width, height)
     photograph, render = (values.astype(np.float32) / 255 for values in (pixels, probe.rgb))
     p, r = (values[probe.valid] for values in (photograph, render))
     square = (p * p).sum(axis=0)
     gain = np.where(square > 0, (p * r).sum(axis=0) / np.maximum(square, 1e-9), 1).clip(*GAINS)
-    near = neighbourhood(photograph * gain.astype(np.float32))
-    return ColourRange(
-        np.minimum.reduce(near).reshape(-1, 3), np.maximum.reduce(near).reshape(-1, 3)
-    )
+    found = _range(photograph * gain.astype(np.float32))
+    outside = _outside(_smooth(probe.rgb).reshape(-1, 3), found) > MIN_DIFFERENCE
+    return _range(render) if outside[probe.valid.ravel()].mean() > MAX_OUTSIDE else found
+
+
+def _range(picture: NDArray[Any]) -> ColourRange:
+    near = neighbourhood(picture)
+    low, high = np.minimum.reduce(near), np.maximum.reduce(near)
+    return ColourRange(low.reshape(-1, 3), high.reshape(-1, 3))
+
+
+def _outside(colours: Floats, found: ColourRange) -> Floats:
+    """(N,) how far (N, 3) colours are outside their range, in the channel that is farthest."""
+    below, above = found.low - colours, colours - found.high
+    return np.asarray(np.maximum(np.maximum(below, above), 0).max(axis=1))
+
+
+def _smooth(picture: Picture) -> Floats:
+    """(H, W, 3) means over the 3 x 3 neighbourhoods, in [0, 1]."""
+    total = np.add.reduce(neighbourhood(picture.astype(np.float32)))
+    return np.asarray(total / np.float32(9 * 255))
 
 
 def _judge(
@@ -251,10 +271,7 @@ def _judge(
 ) -> Contradictions:
     points = evidence.points
     sampled = slice(step // 2, None, step)
-    rgb, beyond = (
-        np.add.reduce(neighbourhood(picture.astype(np.float32)))[sampled, sampled] / (9 * 255)
-        for picture in (novel.probe.rgb, novel.beyond)
-    )
+    rgb, beyond = (_smooth(p)[sampled, sampled] for p in (novel.probe.rgb, novel.beyond))
     depth = novel.probe.depth[sampled, sampled]
     few = (evidence.count < MIN_AGREEING).reshape(depth.shape)
     veiled = np.abs(rgb - beyond).max(axis=2) > MIN_DIFFERENCE
@@ -263,9 +280,8 @@ def _judge(
     for i in evidence.photographs:
         visibility = find_visible(training.probes[i], points.xyz, points.empty)
         seen, pixel = visibility.visible, visibility.pixel
-        below, above = colours[i].low[pixel] - shown[seen], shown[seen] - colours[i].high[pixel]
-        outside = np.maximum(np.maximum(below, above), 0).max(axis=1)
-        difference[seen] = np.minimum(difference[seen], outside)
+        expected = ColourRange(colours[i].low[pixel], colours[i].high[pixel])
+        difference[seen] = np.minimum(difference[seen], _outside(shown[seen], expected))
     wrong = np.isfinite(difference) & (difference > MIN_DIFFERENCE)
     contradicted = floating | wrong.reshape(depth.shape)
     unseen = (evidence.count == 0).reshape(depth.shape) & ~contradicted

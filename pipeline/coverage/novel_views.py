@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -12,7 +12,7 @@ from pipeline.coverage.defects import MIN_AGREEING, NEAR_SHARE
 from pipeline.coverage.probe_views import Bools, Doubles
 from pipeline.coverage.summary import heading
 from pipeline.coverage.training_views import SurfaceSample, TrainingViews, evenly
-from pipeline.coverage.viewpoints import features, place_evidence, subject_distance
+from pipeline.coverage.viewpoints import features, subject_distance
 from pipeline.geometry.rotations import quat_to_rotation, rotation_from_vector, rotation_to_quat
 from pipeline.scene.views import View
 
@@ -25,11 +25,9 @@ MAX_CAMERAS = 6
 BESIDE, BEHIND, RAISED = 0.3, 0.35, 0.3
 #: Cameras whose viewing directions differ by more than acos(this) are not neighbours.
 NEIGHBOUR_COSINE = 0.5
-#: Places that no photograph shows are at most this far from a camera, in the same unit.
-REACH = 0.4
-#: Places are at least this far from the surface that training views show, in the same unit, or
-#: half as far as the camera itself: surfaces go on a little beyond the photographs, and one does
-#: not look at a wall from inside.
+#: On the way to a place, one stays at least this far from the surface that training views show, in
+#: the same unit, or half as far as the camera itself: surfaces go on a little beyond the
+#: photographs, and one does not look at a wall from inside.
 CLEARANCE = 0.2
 
 
@@ -56,12 +54,11 @@ def choose_novel_views(training: TrainingViews, up: Doubles) -> list[NovelView]:
     Args:
         up: (3,) up vector of the world.
     """
-    candidates = list(_candidates(training, up))
-    free = _free(candidates, training)
+    surface = training.surface.xyz[_is_surface(training.surface)]
     chosen: dict[tuple[int, Kind], NovelView] = {}
-    for (base, novel), is_free in zip(candidates, free, strict=True):
-        if is_free:
-            chosen.setdefault((base, novel.kind), novel)
+    for base, novel in _candidates(training, up):
+        if (base, novel.kind) not in chosen and _is_free(novel, surface):
+            chosen[base, novel.kind] = novel
     return list(chosen.values())
 
 
@@ -92,22 +89,11 @@ def _candidates(training: TrainingViews, up: Doubles) -> Iterator[tuple[int, Nov
             yield number, NovelView(kind, view, novel, distance)
 
 
-def _free(candidates: Sequence[tuple[int, NovelView]], training: TrainingViews) -> list[bool]:
-    """Whether one can stand at each place: a photograph sees a surface behind it, or a camera is
-    near and no photograph has a surface in front of it; and no surface is close."""
-    if not candidates:
-        return []
-    places = np.stack([novel.view.centre for _, novel in candidates])
-    distance = np.array([novel.distance for _, novel in candidates])
-    free, unseen = place_evidence(places, REACH * distance, training.probes)
-    surface = training.surface.xyz[_is_surface(training.surface)]
-
-    def is_clear(novel: NovelView) -> bool:
-        own, moved = (_clearance(view.centre, surface) for view in (novel.base, novel.view))
-        return moved > min(CLEARANCE * novel.distance, own / 2)
-
-    clear = [is_clear(novel) for _, novel in candidates]
-    return [bool(value) for value in (free | unseen) & clear]
+def _is_free(novel: NovelView, surface: Doubles) -> bool:
+    """Whether one can go straight from the camera to the place."""
+    start, end = novel.base.centre, novel.view.centre
+    limit = min(CLEARANCE * novel.distance, _clearance(start, start, surface) / 2)
+    return _clearance(start, end, surface) > limit
 
 
 def _is_surface(sample: SurfaceSample) -> Bools:
@@ -117,9 +103,12 @@ def _is_surface(sample: SurfaceSample) -> Bools:
     return np.asarray(agreed & (sample.seen_past < MIN_AGREEING))
 
 
-def _clearance(place: Doubles, surface: Doubles) -> float:
-    """The distance of a place from the nearest of (N, 3) points."""
-    return float(np.sqrt(((surface - place) ** 2).sum(axis=1).min(initial=np.inf)))
+def _clearance(start: Doubles, end: Doubles, surface: Doubles) -> float:
+    """The distance of a straight line from the nearest of (N, 3) points."""
+    along, offset = end - start, surface - start
+    share = (offset * along).sum(axis=1) / max(float((along**2).sum()), 1e-30)
+    nearest = share.clip(0, 1)[:, None] * along
+    return float(np.sqrt(((offset - nearest) ** 2).sum(axis=1).min(initial=np.inf)))
 
 
 def _neighbour(described: Doubles, i: int) -> int | None:

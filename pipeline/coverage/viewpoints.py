@@ -252,24 +252,15 @@ def _free_places(
     the place, near a camera and not below the lowest one (which excludes places under ground)."""
     xyz = np.array([viewpoint.view.centre for viewpoint in viewpoints]).reshape(-1, 3)
     reach = BLIND_REACH * np.array([viewpoint.distance for viewpoint in viewpoints])
-    free, unseen = place_evidence(xyz, reach, probes)
-    lowest = min(float(probe.view.centre @ up) for probe in probes)
-    return np.asarray(free | (unseen & (xyz @ up >= lowest)))
-
-
-def place_evidence(
-    places: Doubles, reach: Doubles, probes: Sequence[ProbeView]
-) -> tuple[Bools, Bools]:
-    """(N,) True where a photograph sees a surface behind the place; (N,) True where a camera is
-    within ``reach``, and no photograph shows a surface at the place or in front of it."""
-    free, occluded, near = np.zeros((3, len(places)), bool)
+    free, occluded, near = np.zeros((3, len(xyz)), bool)
     for probe in probes:
-        visibility = find_visible(probe, places, np.zeros(len(places), bool))
+        visibility = find_visible(probe, xyz, np.zeros(len(xyz), bool))
         free |= visibility.seen_past
         occluded |= visibility.occluded
         occluded[visibility.visible] = True
-        near |= np.linalg.norm(places - probe.view.centre, axis=1) <= reach
-    return free, near & ~occluded
+        near |= np.linalg.norm(xyz - probe.view.centre, axis=1) <= reach
+    lowest = min(float(probe.view.centre @ up) for probe in probes)
+    return np.asarray(free | (near & ~occluded & (xyz @ up >= lowest)))
 
 
 def _render_candidates(

@@ -23,6 +23,7 @@ from benchmarks.results import (
     GrowthResult,
     JudgeResult,
     MemoryResult,
+    NovelViewResult,
     PoseOutcome,
     PoseResult,
     ScalingResult,
@@ -55,6 +56,20 @@ def memory(found: Sequence[MemoryResult]) -> str:
                 f"{r.planned_mb / r.peak_mb:.2f}",
             ]
         )
+    return markdown.table(rows)
+
+
+def novel_views(found: Sequence[NovelViewResult]) -> str:
+    rows = [
+        [
+            *("run", "novel views", "kind", "contradicted (%)", "in no photograph (%)"),
+            *("against", "PSNR (dB)", "SSIM"),
+        ]
+    ]
+    for r in found:
+        shares = (f"{100 * share:.2f}" for share in (r.contradicted_share, r.unseen_share))
+        agreement = (cell(r.psnr, ".2f"), cell(r.ssim, ".4f"))
+        rows.append([r.run, str(r.views), r.kind, *shares, r.against or "-", *agreement])
     return markdown.table(rows)
 
 
@@ -228,6 +243,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "blocks": (BlocksResult, blocks),
     "budgets": (BudgetResult, budget_tables.table),
     "budget-curves": (BudgetResult, budget_tables.curves),
+    "novel_views": (NovelViewResult, novel_views),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

@@ -33,6 +33,32 @@ class GeoreferenceResult:
     errors: tuple[float, float, float, float] | None
 
 
+# ---- benchmarks.novel_views ----
+
+
+@dataclass(frozen=True)
+class NovelViewResult:
+    """The novel views of one kind of a finished scene.
+
+    Attributes:
+        run: The name of its folder.
+        against: The name of the folder of the model that it is compared with; empty without one.
+        kind: One of ``pipeline.coverage.novel_views.KINDS``.
+        views: The number of views.
+        contradicted_share, unseen_share: The mean shares of pixels, as in ``coverage.json``.
+        psnr, ssim: The means between the renders of the two models; None without another model.
+    """
+
+    run: str
+    against: str
+    kind: str
+    views: int
+    contradicted_share: float
+    unseen_share: float
+    psnr: float | None
+    ssim: float | None
+
+
 # ---- benchmarks.memory ----
 
 

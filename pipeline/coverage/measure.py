@@ -13,6 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.coverage.contradictions import (
+    compare_novel_views,
+    contradiction_map,
+    find_contradictions,
+)
 from pipeline.coverage.defects import floating, holes, near_floaters
 from pipeline.coverage.probe_views import (
     Bools,
@@ -20,7 +25,6 @@ from pipeline.coverage.probe_views import (
     Floats,
     ProbeView,
     Renderer,
-    backproject,
     render_probes,
 )
 from pipeline.coverage.record import (
@@ -28,6 +32,9 @@ from pipeline.coverage.record import (
     ErrorByTrust,
     ErrorClass,
     FloaterCoverage,
+    NovelKind,
+    NovelPlace,
+    NovelViewCoverage,
     ProposedViewpoint,
     SeenBy,
     SurfaceCoverage,
@@ -35,7 +42,13 @@ from pipeline.coverage.record import (
     ViewCoverage,
 )
 from pipeline.coverage.summary import describe
-from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
+from pipeline.coverage.training_views import (
+    MAX_TRAINING_VIEWS,
+    SurfaceSample,
+    TrainingViews,
+    render_training_views,
+)
+from pipeline.coverage.trust import LOW_TRUST, trust_maps
 from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.metrics.protocol import Protocol
@@ -50,9 +63,8 @@ from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View, evenly_spaced, scene_up
 from pipeline.splats.gaussians import Gaussians
 
-#: Largest numbers of training views, of test views, and of training views whose surface points are
-#: counted. Larger sets are sampled evenly.
-MAX_TRAINING_VIEWS, MAX_TEST_VIEWS, MAX_SAMPLED = 200, 12, 12
+#: Largest number of test views. Larger sets are sampled evenly.
+MAX_TEST_VIEWS = 12
 #: Number of test views, those of least trust, whose images are written.
 SHOWN = 2
 #: Error and trust are averaged over square blocks of the maps; side in pixels.
@@ -152,27 +164,25 @@ def measure_coverage(
     def render(view: View) -> Render:
         return render_view(gaussians, view, options)
 
-    training = evenly_spaced([view for view in views if not view.is_test], MAX_TRAINING_VIEWS)
-    rendered = render_probes(training, render)
-    probes = list(track(rendered, "rendering training views", len(training), unit="views"))
-    depths = np.concatenate([probe.depth[~probe.empty] for probe in probes])
+    num_training = sum(not view.is_test for view in views)
     record = CoverageRecord(
-        num_training_views=sum(not view.is_test for view in views),
-        num_rendered_views=len(probes),
+        num_training_views=num_training,
+        num_rendered_views=min(num_training, MAX_TRAINING_VIEWS),
         trust_definition=FORMULA,
     )
-    if not len(depths):
+    training = render_training_views(views, render)
+    if training is None:
         record = record.model_copy(update={"reason": "the scene shows no surface"})
         record.write(out)
         return record
-    background_depth = float(np.percentile(depths, 95))
-    surface, nearest = _surface(evenly_spaced(probes, MAX_SAMPLED), probes, background_depth)
+    probes, background_depth = training.probes, training.background_depth
+    nearest = training.surface.nearest
     tested = _measure_test_views(
         evaluation, renders, protocol, probes, render, background_depth, nearest, threads
     )
     # Photographs of test views exist as well: proposals must not repeat them.
     all_probes = [*probes, *(item.probe for item in tested)]
-    cameras = [*training, *(_named(views, item.probe.view.name) for item in tested)]
+    cameras = [*training.views, *(_named(views, item.probe.view.name) for item in tested)]
     best = propose_viewpoints(cameras, all_probes, render, world.up, background_depth)
     floaters = near_floaters(gaussians, probes, all_probes[len(probes) :], nearest)
     shown = sorted(
@@ -185,7 +195,7 @@ def measure_coverage(
     }
     record = record.model_copy(
         update={
-            "surface": surface,
+            "surface": _surface(training.surface),
             "views": tuple(_with_images(item.record, images) for item in tested),
             "error": _error_by_trust(tested),
             "floaters": FloaterCoverage(
@@ -193,6 +203,7 @@ def measure_coverage(
                 search_distance=floaters.within / world.normalization.scale,
                 by_camera=floaters.cameras,
             ),
+            "novel_views": _novel_views(out, training, gaussians, options, world),
             "surroundings": Surroundings(
                 num_viewpoints=len(best.candidates),
                 mean_trust=best.trust_before,
@@ -214,32 +225,18 @@ def _named(views: Sequence[View], name: str) -> View:
     return next(view for view in views if view.name == name)
 
 
-def _surface(
-    sampled: Sequence[ProbeView], probes: Sequence[ProbeView], background_depth: float
-) -> tuple[SurfaceCoverage | None, float]:
-    """Statistics of how the training views ``probes`` observe the surface that ``sampled`` show,
-    None if none of them sees it, and the distance of the nearest surface (2nd percentile) that at
-    least 3 of them see; 0 if there is none."""
-    counts, parallax, depth = [], [], []
-    for probe in track(sampled, "counting observations", len(sampled), unit="views"):
-        points = backproject(probe, background_depth, 4)
-        observed = collect_observations(probes, points)
-        on_surface = ~points.empty & (observed.count > 0)
-        counts.append(observed.count[on_surface])
-        parallax.append(observed.parallax[on_surface])
-        depth.append(probe.focal / points.resolution[on_surface])
-    count, angle, z = (np.concatenate(values) for values in (counts, parallax, depth))
-    if not len(count):
-        return None, 0.0
-    certain = z[count > 2]
+def _surface(sample: SurfaceSample) -> SurfaceCoverage | None:
+    if not len(sample.count):
+        return None
+    count = sample.count
     seen_by = SeenBy(
         one=_share(count == 1), two=_share(count == 2), three_or_more=_share(count > 2)
     )
     return SurfaceCoverage(
         seen_by=seen_by,
         median_photographs=float(np.median(count)),
-        median_parallax_deg=_rounded(np.median(angle)),
-    ), float(np.percentile(certain, 2)) if len(certain) else 0.0
+        median_parallax_deg=_rounded(np.median(sample.parallax)),
+    )
 
 
 def _measure_test_views(
@@ -253,8 +250,9 @@ def _measure_test_views(
     threads: int,
 ) -> list[MeasuredView]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
-    tested = [item for item in evaluation.per_view if item.name in by_name]
-    items = evenly_spaced(tested, MAX_TEST_VIEWS)
+    items = evenly_spaced(
+        [item for item in evaluation.per_view if item.name in by_name], MAX_TEST_VIEWS
+    )
     views = [by_name[item.name] for item in items]
     test_probes = list(render_probes(views, render))
     maps = trust_maps(test_probes, probes, background_depth, threads)
@@ -372,14 +370,56 @@ def _proposals(
     return tuple(found)
 
 
+def _novel_views(
+    out: Path,
+    training: TrainingViews,
+    gaussians: Gaussians,
+    options: RasterOptions,
+    world: WorldFrame,
+) -> NovelViewCoverage | None:
+    """The novel views, with the images of the worst one written; None without any."""
+    background, threads = options.background, options.threads
+    found = compare_novel_views(training, world.up, gaussians, options)
+    if found is None:
+        return None
+    worst = int(found.shares[:, 0].argmax())
+    novel, shown = found.views[worst], found.probes[worst]
+    (contradictions,) = find_contradictions([shown], training, background, threads)
+    names = "coverage/novel_render.png", "coverage/novel_map.png"
+    _write_pngs(out, names, (shown.probe.rgb, contradiction_map(shown.probe, contradictions)))
+    by_kind: dict[str, NovelKind] = {
+        kind: NovelKind(num_views=number, **_shares(shares))
+        for kind, (number, shares) in found.by_kind().items()
+    }
+    view = world.normalization.view_to_given(novel.view)
+    place = NovelPlace(
+        kind=novel.kind,
+        near=novel.base.name,
+        **_shares(found.shares[worst]),
+        world_to_camera=_rounded(view.world_to_camera, 9 + world.digits),
+        render=names[0],
+        map=names[1],
+    )
+    return NovelViewCoverage(**_shares(found.shares.mean(axis=0)), by_kind=by_kind, worst=place)
+
+
+def _shares(values: Doubles) -> dict[str, Any]:
+    contradicted, unseen = _rounded(values, 4)
+    return {"contradicted_share": contradicted, "unseen_share": unseen}
+
+
 def _write_images(out: Path, name: str, probe: ProbeView, trust: Floats) -> Images:
     """Write the render and the trust map (grey, white is 1) of a probe view."""
     files = Images(f"coverage/{name}_render.png", f"coverage/{name}_trust.png")
-    for file, picture in zip(files, (probe.rgb, to_bytes(trust)), strict=True):
+    _write_pngs(out, files, (probe.rgb, to_bytes(trust)))
+    return files
+
+
+def _write_pngs(out: Path, files: Sequence[str], pictures: Sequence[NDArray[np.uint8]]) -> None:
+    for file, picture in zip(files, pictures, strict=True):
         buffer = io.BytesIO()
         Image.fromarray(picture).save(buffer, "PNG")
         write_bytes(out / file, buffer.getvalue())
-    return files
 
 
 def _share(condition: NDArray[Any]) -> float:

@@ -80,6 +80,7 @@ class Visibility:
 
     Attributes:
         visible: (M,) indices of the visible points: those on the surface that the camera renders.
+        pixel: (M,) the pixels that show the visible points, in row-major order.
         seen_past: (N,) True if the camera renders a surface, or none, behind the point.
         occluded: (N,) True if the camera renders a surface in front of the point.
         to_camera: (M, 3) unit vectors from the visible points to the camera.
@@ -87,6 +88,7 @@ class Visibility:
     """
 
     visible: NDArray[np.intp]
+    pixel: NDArray[np.intp]
     seen_past: Bools
     occluded: Bools
     to_camera: Floats
@@ -121,12 +123,18 @@ def render_probes(views: Sequence[View], render: Renderer) -> Iterator[ProbeView
 
 def _neighbourhood_range(depth: Floats) -> tuple[Floats, Floats]:
     """Minimum and maximum of the finite depths in each 3 x 3 neighbourhood; inf without any."""
-    height, width = depth.shape
-    padded = np.pad(depth, 1, mode="edge")
-    shifted = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    shifted = neighbourhood(depth)
     minimum = np.minimum.reduce(shifted)
     maximum = np.maximum.reduce([np.where(np.isfinite(part), part, 0) for part in shifted])
     return minimum, np.where(maximum > 0, maximum, np.float32(np.inf))
+
+
+def neighbourhood(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """The nine images (H, W, ...) that have at each pixel a pixel of its 3 x 3 neighbourhood;
+    edges are repeated."""
+    height, width = values.shape[:2]
+    padded = np.pad(values, [(1, 1), (1, 1), *[(0, 0)] * (values.ndim - 2)], mode="edge")
+    return [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
 
 
 def backproject(probe: ProbeView, background_depth: float, step: int = 1) -> QueryPoints:
@@ -161,17 +169,7 @@ def find_visible(probe: ProbeView, xyz: Doubles, empty: Bools) -> Visibility:
         empty: (N,) True for background points, which lie on no surface: they are visible in pixels
             whose ray meets no surface.
     """
-    view = probe.view
-    # Subtracted in double precision: scenes may lie far from the origin.
-    offset = (xyz - view.centre).astype(np.float32)
-    x, y, z = _columns(offset, view.world_to_camera[:3, :3].astype(np.float32))
-    inverse = 1 / np.where(z > 0, z, np.float32(np.inf))
-    column = x * inverse * np.float32(view.fx) + np.float32(view.cx)
-    row = y * inverse * np.float32(view.fy) + np.float32(view.cy)
-    inside = np.flatnonzero(
-        (z > 0) & (column >= 0) & (row >= 0) & (column < view.width) & (row < view.height)
-    )
-    pixel = row[inside].astype(np.intp) * view.width + column[inside].astype(np.intp)
+    inside, pixel, z = project(probe.view, xyz)
     valid = probe.valid.ravel()[pixel]
     inside, pixel = inside[valid], pixel[valid]
     depth, nearest = z[inside], probe.min_depth.ravel()[pixel]
@@ -182,10 +180,33 @@ def find_visible(probe: ProbeView, xyz: Doubles, empty: Bools) -> Visibility:
     seen_past, occluded = np.zeros((2, len(xyz)), bool)
     seen_past[inside], occluded[inside] = in_front & ~found, ~in_front & ~found
     visible = inside[found]
-    to_camera = -offset[visible]
+    to_camera = (probe.view.centre - xyz[visible]).astype(np.float32)
     to_camera = to_camera / np.sqrt((to_camera**2).sum(axis=1, keepdims=True))
     resolution = (probe.focal / z[visible]).astype(np.float32)
-    return Visibility(visible, seen_past, occluded, to_camera, resolution)
+    return Visibility(visible, pixel[found], seen_past, occluded, to_camera, resolution)
+
+
+def project(view: View, xyz: Doubles) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Project points into a view.
+
+    Args:
+        xyz: (N, 3) world.
+
+    Returns:
+        (M,) indices of the points inside the image, (M,) the pixels that contain them, in row-major
+        order, and (N,) camera z of all points.
+    """
+    # Subtracted in double precision: scenes may lie far from the origin.
+    offset = (xyz - view.centre).astype(np.float32)
+    x, y, z = _columns(offset, view.world_to_camera[:3, :3].astype(np.float32))
+    inverse = 1 / np.where(z > 0, z, np.float32(np.inf))
+    column = x * inverse * np.float32(view.fx) + np.float32(view.cx)
+    row = y * inverse * np.float32(view.fy) + np.float32(view.cy)
+    inside = np.flatnonzero(
+        (z > 0) & (column >= 0) & (row >= 0) & (column < view.width) & (row < view.height)
+    )
+    pixel = row[inside].astype(np.intp) * view.width + column[inside].astype(np.intp)
+    return inside, pixel, z
 
 
 def rotate(vectors: NDArray[Any], rotation: NDArray[Any]) -> NDArray[Any]:

@@ -12,6 +12,9 @@ from pipeline.runtime.text import counted
 RENDER = "File of the render, relative to the stage's folder"
 TRUST_MAP = "File of the trust of each pixel: grey, 0 to 255 for 0 to 1"
 
+#: Share of contradicted pixels of novel views from which it is part of the summaries.
+CONSPICUOUS_SHARE = 0.05
+
 
 class SeenBy(JsonObject):
     """Shares of the surface, 0 to 1, by the number of training views that see it."""
@@ -84,6 +87,50 @@ class FloaterCoverage(JsonObject):
     )
 
 
+class NovelKind(JsonObject):
+    """Means over the novel views of one kind; shares are of all pixels, 0 to 1."""
+
+    num_views: int = Field(ge=1, description="Number of novel views.")
+    contradicted_share: float = Field(
+        ge=0, le=1, description="Pixels that contradict the photographs: floaters, veils and haze."
+    )
+    unseen_share: float = Field(
+        ge=0, le=1, description="Other pixels, whose surface no training view sees."
+    )
+
+
+class NovelPlace(JsonObject):
+    """A novel view; world to camera in COLMAP's convention, in the scene's frame."""
+
+    kind: str = Field(description="The kind of the view.")
+    near: str = Field(description="The name of the training view that was moved.")
+    contradicted_share: float = Field(ge=0, le=1, description="Pixels, as in `by_kind`.")
+    unseen_share: float = Field(ge=0, le=1, description="Pixels, as in `by_kind`.")
+    world_to_camera: Matrix4 = Field(description="4 x 4 by rows.")
+    render: str = Field(description=f"{RENDER}.")
+    map: str = Field(
+        description="File of the render, dimmed, with contradicted pixels orange, unseen ones blue."
+    )
+
+
+class NovelViewCoverage(JsonObject):
+    """What views show that stand where no photograph does, compared with the photographs."""
+
+    contradicted_share: float = Field(ge=0, le=1, description="Mean over all novel views.")
+    unseen_share: float = Field(ge=0, le=1, description="Mean over all novel views.")
+    by_kind: dict[str, NovelKind] = Field(
+        description="`between` two cameras; `beside` a camera, by 0.3 of the distance to its "
+        "subject; `behind` it, by 0.35; `raised` by 0.3, looking at the same subject. Kinds "
+        "without a free place are left out."
+    )
+    worst: NovelPlace = Field(description="The view with most contradicted pixels.")
+
+    @property
+    def is_conspicuous(self) -> bool:
+        """Whether the contradictions are worth a word where few figures are shown."""
+        return self.contradicted_share >= CONSPICUOUS_SHARE
+
+
 class Surroundings(JsonObject):
     """Trust around the photographs, over viewpoints from which more could be taken."""
 
@@ -133,6 +180,9 @@ class CoverageRecord(JsonFile, JsonObject):
     )
     error: ErrorByTrust | None = Field(None, description="null with a `reason`.")
     floaters: FloaterCoverage | None = Field(None, description="null with a `reason`.")
+    novel_views: NovelViewCoverage | None = Field(
+        None, description="null with a `reason`, or if there is no free place beside the cameras."
+    )
     surroundings: Surroundings | None = Field(None, description="null with a `reason`.")
     viewpoints: tuple[ProposedViewpoint, ...] = Field(
         (), description="In the order in which they raise trust most."
@@ -142,4 +192,8 @@ class CoverageRecord(JsonFile, JsonObject):
         """What was found, in a few words for the terminal."""
         if self.surface is None:
             return self.reason
-        return f"{counted(len(self.viewpoints), 'place')} to photograph next"
+        places = f"{counted(len(self.viewpoints), 'place')} to photograph next"
+        if self.novel_views is None or not self.novel_views.is_conspicuous:
+            return places
+        percent = f"{100 * self.novel_views.contradicted_share:.0f} %"
+        return f"{places}; {percent} of what one sees beside the photographs contradicts them"

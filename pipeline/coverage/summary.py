@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.coverage.probe_views import Doubles, ProbeView, find_visible
 from pipeline.coverage.viewpoints import STEEP_COSINE, Viewpoint
+from pipeline.scene.views import View
 
 #: Offsets below this share of the subject distance are not described.
 _MIN_OFFSET = 0.08
@@ -45,7 +46,7 @@ def describe(
         along = centres[second] - start
         level = _horizontal(along, up)
         start = start + along * float((place - start) @ level / (level @ level))
-    right, ahead = _heading(probes[first], up)
+    right, ahead = heading(probes[first].view, up)
     step = place - start
     steps = [
         _step(float(step @ up), "higher", "lower", viewpoint.distance, unit),
@@ -82,9 +83,9 @@ def _horizontal(vectors: Doubles, up: Doubles) -> Doubles:
     return np.asarray(vectors - (vectors @ up)[..., None] * up)
 
 
-def _heading(probe: ProbeView, up: Doubles) -> tuple[Doubles, Doubles]:
+def heading(view: View, up: Doubles) -> tuple[Doubles, Doubles]:
     """Horizontal unit vectors to the right of and ahead of a camera."""
-    rotation = probe.view.world_to_camera[:3, :3]
+    rotation = view.world_to_camera[:3, :3]
     ahead = rotation[2] if abs(float(rotation[2] @ up)) < STEEP_COSINE else -rotation[1]
     ahead = _horizontal(ahead, up)
     ahead = ahead / np.linalg.norm(ahead)

@@ -44,7 +44,7 @@ BLIND_REACH = 0.4
 MIN_CLEARANCE = 0.25
 #: ...or if more than this share of its rays meets no surface.
 MAX_EMPTY = 0.7
-#: Least distance between two candidates, or a candidate and a photograph, in ``_features``.
+#: Least distance between two candidates, or a candidate and a photograph, in ``features``.
 MIN_SEPARATION = 0.15
 #: Stride of the evaluated pixels of a candidate.
 PIXEL_STEP = 6
@@ -171,7 +171,7 @@ def _candidates(views: Sequence[View], probes: Sequence[ProbeView], up: Doubles)
     scale = float(np.median(distances[distances > 0])) if (distances > 0).any() else 0.0
     if scale == 0:
         return []
-    photographed = np.stack([_features(view, scale) for view in views])
+    photographed = np.stack([features(view, scale) for view in views])
     bases = _farthest_points(photographed, MAX_BASES, np.full(len(photographed), np.inf))
     moved = [
         _orbit(views[i], float(distances[i]), up, *move)
@@ -187,9 +187,9 @@ def _candidates(views: Sequence[View], probes: Sequence[ProbeView], up: Doubles)
     moved = [item for item, is_free in zip(moved, free, strict=True) if is_free]
     if not moved:
         return []
-    features = np.stack([_features(viewpoint.view, scale) for viewpoint in moved])
-    apart = np.min([np.linalg.norm(features - other, axis=1) for other in photographed], axis=0)
-    return [moved[i] for i in _farthest_points(features, MAX_CANDIDATES, apart)]
+    described = np.stack([features(viewpoint.view, scale) for viewpoint in moved])
+    apart = np.min([np.linalg.norm(described - other, axis=1) for other in photographed], axis=0)
+    return [moved[i] for i in _farthest_points(described, MAX_CANDIDATES, apart)]
 
 
 def subject_distance(probe: ProbeView) -> float:
@@ -223,7 +223,7 @@ def _rotation(axis: Doubles, degrees: float) -> Doubles:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
-def _features(view: View, scale: float) -> Doubles:
+def features(view: View, scale: float) -> Doubles:
     """(6,) position, in units of the median subject distance, and viewing direction."""
     return np.concatenate([view.centre / scale, view.world_to_camera[2, :3]])
 

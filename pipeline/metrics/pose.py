@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.geometry.similarity import umeyama
+from pipeline.geometry.similarity import Similarity, umeyama
 from pipeline.io.names import NameIndex
 from pipeline.runtime.json_file import JsonObject
 from pipeline.scene.reconstruction import Reconstruction
@@ -48,8 +48,7 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
     Images of the truth that the estimate lacks count as failures in the AUC, and in
     ``num_common`` against ``num_truth``; the other figures are over the common ones.
 
-    The rotation of the alignment is computed from the centres if they determine it, else (two
-    common images, or collinear centres) from the camera rotations.
+    The alignment is that of ``align_poses``.
     """
     posed, true = estimated.by_name(), truth.by_name()
     names = sorted(true)
@@ -77,14 +76,9 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
     c_found = np.stack([found[n].centre for n in common])
     c_true = np.stack([true[n].centre for n in common])
     radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))
-    scale, world, shift = umeyama(c_found, c_true)
-    if len(common) < 3 or _spread_dimensions(c_true) < 2 or _spread_dimensions(c_found) < 2:
-        # R_true ~ R_found @ world.T for each image; their chordal mean.
-        u, _, vt = np.linalg.svd(np.einsum("nij,nik->jk", r_true, r_found))
-        world = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-        shift = c_true.mean(0) - scale * world @ c_found.mean(0)
-    rotations = _angle(r_found @ world.T, r_true)
-    centres = np.linalg.norm(scale * c_found @ world.T + shift - c_true, axis=1)
+    aligned = align_poses(r_found, c_found, r_true, c_true)
+    rotations = _angle(r_found @ aligned.rotation.T, r_true)
+    centres = np.linalg.norm(aligned(c_found) - c_true, axis=1)
     enough = len(common) >= 3
     median = float(np.median(centres))
     return PoseError(
@@ -94,11 +88,30 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
         centre_mean=float(centres.mean()) if enough else None,
         centre_relative_median=median / radius if enough and radius > 0 else None,
         radius=radius,
-        scale=scale,
+        scale=aligned.scale,
         auc=auc,
         num_common=len(common),
         num_truth=len(names),
     )
+
+
+def align_poses(r_source: Array, c_source: Array, r_target: Array, c_target: Array) -> Similarity:
+    """The similarity of the worlds of two sets of poses of the same images.
+
+    Its rotation is computed from the centres if they determine it, else (one or two images, or
+    collinear centres) from the camera rotations.
+
+    Args:
+        r_source, r_target: (N, 3, 3) world-to-camera rotations.
+        c_source, c_target: (N, 3) camera centres.
+    """
+    scale, rotation, shift = umeyama(c_source, c_target)
+    if len(c_source) < 3 or min(map(_spread_dimensions, (c_source, c_target))) < 2:
+        # R_target ~ R_source @ rotation.T for each image; their chordal mean.
+        u, _, vt = np.linalg.svd(np.einsum("nij,nik->jk", r_target, r_source))
+        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        shift = c_target.mean(0) - scale * rotation @ c_source.mean(0)
+    return Similarity(scale, rotation, shift)
 
 
 def auc_of_errors(errors: Array, limit: float) -> float:

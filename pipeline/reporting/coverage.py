@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from pipeline.coverage.record import (
     CoverageRecord,
     ErrorByTrust,
+    NovelPlace,
+    NovelViewCoverage,
     ProposedViewpoint,
     ViewCoverage,
 )
@@ -66,6 +68,14 @@ class CoverageContent:
         pictures = {"render": self.pictures[entry.render], "trust": trust}
         return [(kind, embedded(upright(p, orientation))) for kind, p in pictures.items()]
 
+    def novel_pair(self, entry: NovelPlace, orientation: int) -> list[tuple[str, Embedded]]:
+        """The render and the map of a novel view, rotated by an EXIF orientation."""
+        files = {"render": entry.render, "contradictions": entry.map}
+        return [
+            (kind, embedded(upright(self.pictures[file], orientation)))
+            for kind, file in files.items()
+        ]
+
 
 def coverage_content(results: SceneResults) -> CoverageContent:
     """The content of the section."""
@@ -96,6 +106,8 @@ def _facts(record: CoverageRecord) -> list[tuple[str, str]]:
             ("holes in test views", f"{holes:.2%} of pixels"),
             ("floaters in test views", f"{floating:.2%} of pixels"),
         ]
+    if record.novel_views is not None:
+        rows += _novel_rows(record.novel_views)
     if record.floaters is not None:
         by_camera = record.floaters.by_camera
         near = ", ".join(f"{name} ({number})" for name, number in by_camera.items())
@@ -104,6 +116,17 @@ def _facts(record: CoverageRecord) -> list[tuple[str, str]]:
     if record.error is not None:
         rows += _error_rows(record.error)
     return rows
+
+
+def _novel_rows(novel: NovelViewCoverage) -> list[tuple[str, str]]:
+    kinds = novel.by_kind.items()
+    contradicted = ", ".join(f"{kind} {row.contradicted_share:.1%}" for kind, row in kinds)
+    unseen = ", ".join(f"{kind} {row.unseen_share:.1%}" for kind, row in kinds)
+    number = sum(row.num_views for _, row in kinds)
+    return [
+        (f"contradicted in {number} novel views", f"{contradicted} of pixels"),
+        ("in no photograph, in the same views", f"{unseen} of pixels"),
+    ]
 
 
 def _error_rows(error: ErrorByTrust) -> list[tuple[str, str]]:

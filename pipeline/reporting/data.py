@@ -99,8 +99,8 @@ class CoverageSection:
 
     Attributes:
         record: The measures.
-        pictures: The images by the names in ``record``: (H, W, 3) renders and (H, W) trust
-            maps, uint8.
+        pictures: The images by the names in ``record``: (H, W, 3) renders and maps of
+            contradictions, and (H, W) trust maps, uint8.
     """
 
     record: CoverageRecord

@@ -102,10 +102,12 @@ def _coverage(folder: Path) -> CoverageSection:
     record = CoverageRecord.read(folder)
     pictures = {}
     shown: list[ViewCoverage | ProposedViewpoint] = [*record.views, *record.viewpoints]
-    for entry in shown:
-        for name in filter(None, (entry.render, entry.trust_map)):
-            with Image.open(folder / name) as picture:
-                pictures[name] = np.asarray(picture)
+    names = [name for entry in shown for name in (entry.render, entry.trust_map)]
+    if record.novel_views is not None:
+        names += [record.novel_views.worst.render, record.novel_views.worst.map]
+    for name in filter(None, names):
+        with Image.open(folder / name) as picture:
+            pictures[name] = np.asarray(picture)
     return CoverageSection(record, pictures)
 
 

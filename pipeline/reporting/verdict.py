@@ -99,7 +99,7 @@ def verdict(metrics: Metrics, record: CoverageRecord | None = None) -> Verdict:
     """The verdict on a scene, and on its coverage if it is given."""
     grade = grade_of(metrics)
     figures = [_placed_figure(metrics), _error_figure(metrics), _seen_figure(record)]
-    clauses = [_placed(metrics), _sharpness(metrics), _not_seen(record)]
+    clauses = [_placed(metrics), _sharpness(metrics), _not_seen(record), _contradicted(record)]
     return Verdict(
         grade,
         TITLES[grade],
@@ -139,6 +139,15 @@ def _not_seen(record: CoverageRecord | None) -> str:
     if between == "between":
         where = f"between {name}"
     return f"what lies {where} was hardly seen"
+
+
+def _contradicted(record: CoverageRecord | None) -> str:
+    """Floaters and veils beside the photographs' places, if they are conspicuous."""
+    found = None if record is None else record.novel_views
+    if found is None or not found.is_conspicuous:
+        return ""
+    percent = f"{100 * found.contradicted_share:.0f} %"
+    return f"beside the photographs' places, {percent} of what one sees contradicts them"
 
 
 def _placed_figure(metrics: Metrics) -> Figure | None:

@@ -19,6 +19,7 @@ from benchmarks.results import (
     GrowthResult,
     JudgeResult,
     MemoryResult,
+    NovelViewResult,
     PoseResult,
     ScalingResult,
     SlurmResult,
@@ -74,6 +75,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "pose_conventions": (
         PoseResult("fox", "COLMAP text", "axes", "named", "the camera axes look like", 2.5),
         "| fox | 1 | 1 | 0 | 0 | 0 | - |",
+    ),
+    "novel_views": (
+        NovelViewResult("fox", "fox@seed1", "beside", 6, 0.0123, 0.25, 28.125, 0.9),
+        "| fox | 6 | beside | 1.23 | 25.00 | fox@seed1 | 28.12 | 0.9000 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

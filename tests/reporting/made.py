@@ -12,6 +12,9 @@ from pipeline.coverage.record import (
     ErrorByTrust,
     ErrorClass,
     FloaterCoverage,
+    NovelKind,
+    NovelPlace,
+    NovelViewCoverage,
     ProposedViewpoint,
     SeenBy,
     SurfaceCoverage,
@@ -84,7 +87,7 @@ def trained(**changes) -> TrainedScene:
 
 def coverage() -> CoverageSection:
     rng = np.random.default_rng(1)
-    names = [f"coverage/{name}_{kind}.png" for name in ("view_1", "next_1") for kind in "rt"]
+    names = [f"coverage/{name}.png" for name in ("view_r", "view_t", "next_r", "next_t", "novel_r")]
     pictures = {
         name: rng.integers(0, 256, (9, 12, 3) if name.endswith("r.png") else (9, 12), np.uint8)
         for name in names
@@ -116,6 +119,23 @@ def coverage() -> CoverageSection:
             block_px=8,
             rank_correlation=-0.567,
             by_trust=(ErrorClass(trust_range=(0.0, 0.25), share=0.111, rmse=0.2222),),
+        ),
+        novel_views=NovelViewCoverage(
+            contradicted_share=0.034,
+            unseen_share=0.2,
+            by_kind={
+                "beside": NovelKind(num_views=6, contradicted_share=0.0567, unseen_share=0.25),
+                "behind": NovelKind(num_views=4, contradicted_share=0.0, unseen_share=0.125),
+            },
+            worst=NovelPlace(
+                kind="beside",
+                near="2.jpg",
+                contradicted_share=0.1234,
+                unseen_share=0.5,
+                world_to_camera=np.eye(4).tolist(),
+                render=names[4],
+                map=names[4],
+            ),
         ),
         floaters=FloaterCoverage(num_gaussians=13, search_distance=0.5, by_camera={"3.jpg": 13}),
         surroundings=Surroundings(num_viewpoints=40, mean_trust=0.5, mean_trust_with_proposals=0.7),

@@ -100,11 +100,14 @@ def test_no_network_requests() -> None:
 def nasty_coverage() -> CoverageSection:
     made = coverage()
     record = made.record
-    assert record.floaters is not None
+    assert record.floaters is not None and record.novel_views is not None
     changes = {
         "views": [view.model_copy(update={"name": NASTY}) for view in record.views],
         "viewpoints": [v.model_copy(update={"description": NASTY}) for v in record.viewpoints],
         "floaters": record.floaters.model_copy(update={"by_camera": {NASTY: 1}}),
+        "novel_views": record.novel_views.model_copy(
+            update={"worst": record.novel_views.worst.model_copy(update={"near": NASTY})}
+        ),
     }
     return dataclasses.replace(made, record=record.model_copy(update=changes))
 
@@ -113,6 +116,13 @@ def test_viewpoints_are_on_the_map_of_cameras() -> None:
     page = Page(report_html(report()))
     marks = [a.get("class") for tag, a in page.tags if tag == "circle" and "class" in a]
     assert [marks.count(kind) for kind in ("train", "test", "next")] == [4, 1, 1]
+
+
+def test_the_worst_novel_view_is_shown_with_its_contradictions() -> None:
+    text = Page(report_html(report())).all_text()
+    assert "3.4 % of what one sees beside the photographs' places contradicts them" in text
+    assert "The worst place is beside 2.jpg, with 12.3 % contradicted" in text
+    assert "contradicted in 10 novel views" in text and "beside 5.7%, behind 0.0%" in text
 
 
 def test_no_string_of_the_user_becomes_markup() -> None:
@@ -157,7 +167,7 @@ def test_no_string_of_the_user_becomes_markup() -> None:
 
 def no_test_views() -> CoverageSection:
     error = ErrorByTrust(num_blocks=0, block_px=8, rank_correlation=None, by_trust=())
-    changes = {"views": (), "viewpoints": (), "error": error}
+    changes = {"views": (), "viewpoints": (), "error": error, "novel_views": None}
     return CoverageSection(coverage().record.model_copy(update=changes), {})
 
 

@@ -52,6 +52,18 @@ def test_the_sentence_names_what_was_hardly_seen(description: str, words: str) -
     assert expected in found.sentence
 
 
+@pytest.mark.parametrize(("share", "expected"), [(0.04, False), (0.163, True)])
+def test_the_sentence_names_contradictions_that_are_conspicuous(share: float, expected) -> None:
+    record = coverage().record
+    novel = record.novel_views.model_copy(update={"contradicted_share": share})
+    record = record.model_copy(update={"novel_views": novel})
+    words = "% of what one sees"
+    assert (
+        f"places, 16 {words} contradicts them" in verdict(metrics(), record).sentence
+    ) == expected
+    assert (f"; 16 {words} beside the" in record.headline()) == expected
+
+
 def test_causes_come_before_consequences_and_once() -> None:
     order = ["inspect", "matches", "sfm", "train", "evaluate"]
     groups = grouped_warnings(

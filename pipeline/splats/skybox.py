@@ -23,6 +23,8 @@ from pipeline.splats.init import (
     rotations_to,
 )
 
+# The backgrounds that are a skybox.
+SKYBOXES = ("skybox", "fill")
 # Number of Gaussians: one every 9 degrees, which density control splits where sky has detail.
 NUM_GAUSSIANS = 500
 # The radius is RADIUS times this quantile of the depths of the points.

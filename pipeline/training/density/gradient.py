@@ -92,7 +92,7 @@ class GradientDensity(Strategy):
         split = torch.zeros_like(kept)
         if self.densifies_after(step.steps):
             gradient = self.observed.mean()
-            candidates = kept & (gradient > self.options.grad_threshold)
+            candidates = kept & (gradient > self.options.grad_threshold) & ~step.adam.frozen
             kept = kept & ~self._recycled(step, kept, gradient, candidates)
             # Each split adds one Gaussian.
             split = highest(gradient, candidates & kept, max(0, step.budget - int(kept.sum())))

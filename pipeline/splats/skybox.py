@@ -2,7 +2,8 @@
 "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets").
 
 They become the sky. Where no photograph looks they stay as they are: the colour of the nearest
-points instead of a hole. Uses numpy and scipy, not torch.
+points instead of a hole. Of a scene without sky, training leaves all of them as they are, the fill:
+they would become surfaces at a wrong depth. Uses numpy and scipy, not torch.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ MIN_DEPTH = 1e-12
 SKY_DISTANCE = 5.0
 # Standard deviation, in distances of neighbours. Smaller ones leave gaps.
 SPREAD = 0.7
-# The skybox must hide the background from the first step on.
-OPACITY = 0.95
+# The skybox must hide the background from the first step on. An untrained skybox is recognised by
+# this opacity, which other Gaussians do not start with.
+OPACITY = 0.951
 # The colour of a Gaussian is a mean over this many points, the nearest in direction.
 NUM_POINTS = 16
 
@@ -96,6 +98,11 @@ class Sky:
         total = np.cumsum(np.ones(len(order)) if weights is None else weights[order])
         middle = distance[order[np.searchsorted(total, 0.5 * total[-1])]]
         return np.asarray(distance > SKY_DISTANCE * middle)
+
+
+def untrained(opacity_logits: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(N,) whether Gaussians are of a skybox that no training has changed."""
+    return np.asarray(opacity_logits == np.float32(np.log(OPACITY / (1 - OPACITY))))
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

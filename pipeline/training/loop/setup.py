@@ -19,7 +19,7 @@ from pipeline.runtime.memory import freed_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
-from pipeline.splats.skybox import SKYBOXES, Sky
+from pipeline.splats.skybox import SKYBOXES, Sky, untrained
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
@@ -132,8 +132,7 @@ def initial_state(
     order = rng.permutation(len(scene.views))
     adam = Adam(gaussians, AdamOptions.of(options), backend)
     if options.background == "fill":
-        assert scene.sky is not None
-        adam.freeze(torch.from_numpy(scene.sky.contains(gaussians.means.numpy())))
+        adam.freeze(torch.from_numpy(untrained(gaussians.opacity_logits.numpy())))
     return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
 
 

@@ -20,6 +20,9 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import InitGaussians
+from pipeline.splats.skybox import NUM_GAUSSIANS, with_skybox
 from pipeline.training.checkpoints.checkpoint import PATTERN
 from pipeline.training.data import targets
 from pipeline.training.data.image_store import DiskStore, MemoryStore
@@ -107,6 +110,41 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
     steps = 2 * len(scene.views) - 1
     short = run(planted, tmp_path / "b", fixed.model_copy(update={"steps": steps}))
     assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
+def test_training_leaves_a_fill_as_it_is(scene: TinyScene, tmp_path: Path, strategy: str) -> None:
+    """All photographs see it between the other Gaussians, through opacity resets, density control,
+    a rise of the SH degree and an interruption. A skybox changes."""
+    centres = np.array([view.centre for view in scene.views])
+    arrays = {
+        name: tensor.numpy() for name, tensor in scene.initial.with_sh_degree(0).tensors().items()
+    }
+    with_sky = with_skybox(InitGaussians(**arrays), centres).arrays()
+    initial = Gaussians(**{name: torch.from_numpy(array) for name, array in with_sky.items()})
+    planted = replace(scene, initial=initial)
+    options = tiny_config(
+        60,
+        density={"strategy": strategy, "max_gaussians": 800, "opacity_reset_interval": 3000},
+        sh_degree_interval=1000,
+    )
+    before = {tuple(mean) for mean in initial.means[-NUM_GAUSSIANS:].tolist()}
+
+    def kept(background: str) -> Gaussians:
+        config = options.model_copy(update={"background": background})
+        trained = run(planted, tmp_path / background, config)
+        assert trained.counters["changes"]["split"] + trained.counters["changes"]["cloned"] > 0
+        found = trained.gaussians
+        rows = [tuple(mean) in before for mean in found.means.tolist()]
+        return found.select(torch.nonzero(torch.tensor(rows))[:, 0])
+
+    fill = kept("fill")
+    assert len(fill) == NUM_GAUSSIANS
+    order = {tuple(mean): row for row, mean in enumerate(initial.means.tolist())}
+    same = initial.select(torch.tensor([order[tuple(mean)] for mean in fill.means.tolist()]))
+    for name, tensor in same.with_sh_degree(options.sh_degree).tensors().items():
+        assert torch.allclose(tensor, fill.tensors()[name], rtol=0.0, atol=1e-9), name
+    assert len(kept("skybox")) < NUM_GAUSSIANS
 
 
 def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:

@@ -312,7 +312,7 @@ class Train(Section):
     mask_loss_weight: LossWeight = Field(
         0.1,
         description="Weight of the rendered alpha of pixels that a mask excludes, relative to the "
-        "colour loss. 0: no loss on these pixels.",
+        "colour loss. 0, or background: skybox or fill: no loss on these pixels.",
     )
     density: Density = Field(default_factory=Gradient)
 

@@ -270,8 +270,8 @@ class Train(Section):
     background: Literal["auto", "measured", "skybox", "fill", "black", "white", "random"] = Field(
         "auto",
         description="What is behind the scene. skybox: Gaussians on a distant sphere, which become "
-        "the sky and fill what no photograph shows; fill: the same, but training changes only "
-        "their colours, and does not split them; random: another colour in each step; measured: "
+        "the sky and fill what no photograph shows; fill: the same in the colours of the nearest "
+        "points, which training leaves as they are; random: another colour in each step; measured: "
         "skybox if the photographs show sky, black or white if that is the backdrop's colour, "
         "black if masks leave an object that stands alone, else fill; auto: white if most images "
         "have alpha, black if some have or with strategy: original, else measured.",

@@ -41,8 +41,9 @@ SMOOTH, MIN_REGION = 0.06, 0.02
 POINT_DISTANCE = 4
 # Sky is hardly redder than blue, unlike walls in the light of lamps.
 REDNESS = 0.05
-# The photographs show sky from this share of their pixels on.
-SKY_SHARE = 0.01
+# Sky is seen in this share of the photographs, and in at least so many: a bright wall or a window
+# fills the edge of a single one.
+SKY_SHARE, MIN_SKY = 0.15, 2
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Evidence:
         fixed: The share of the border that has the same colour in all photographs.
         colour: The median colour of this share, RGB in [0, 1].
         turn: The largest angle between two optical axes, degrees.
-        sky: The mean share of the pixels that look like sky.
+        sky: The share of the photographs with pixels that look like sky; 0 for a single one.
     """
 
     excluded: float = 0.0
@@ -98,13 +99,16 @@ def measure_evidence(
     xyz = xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
     borders, excluded = zip(*map(_border, pictures), strict=True)
     fixed, colour = _fixed(np.stack(borders))
-    axes = np.stack([view.world_to_camera[2, :3] for view in views])
+    axes = np.stack([view.world_to_camera[2, :3] for view in chosen])
+    # Not a product of matrices, which may round differently with the number of threads.
+    cosine = np.einsum("ik,jk->ij", axes, axes).min()
+    sky = sum(bool(sky_pixels(picture, xyz, up).any()) for picture in pictures)
     return Evidence(
-        float(np.mean(excluded)),
-        fixed,
-        colour,
-        float(np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1).min()))),
-        float(np.mean([sky_pixels(picture, xyz, up).mean() for picture in pictures])),
+        excluded=float(np.mean(excluded)),
+        fixed=fixed,
+        colour=colour,
+        turn=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+        sky=sky / count if sky >= MIN_SKY else 0.0,
     )
 
 
@@ -128,7 +132,7 @@ def choose_background(evidence: Evidence) -> SceneBackground:
             reason=f"{background} background: {evidence.fixed:.0%} of the photographs' border has "
             f"the same colour ({red}, {green}, {blue}) in all of them, a backdrop",
         )
-    sky = f"{evidence.sky:.1%} of the photographs look like sky"
+    sky = f"{evidence.sky:.0%} of the photographs show sky"
     if evidence.sky >= SKY_SHARE:
         return SceneBackground(background="skybox", reason=f"a skybox behind the scene: {sky}")
     return SceneBackground(
@@ -178,7 +182,6 @@ def sky_pixels(
 def _near_points(view: View, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(H, W) bool: pixels within ``POINT_DISTANCE`` of a point in front of the camera."""
     near = np.zeros((view.height, view.width), np.uint8)
-    # Not a product of matrices, which may round differently with the number of threads.
     camera = np.einsum("ij,pj->pi", view.world_to_camera[:3, :3], xyz)
     camera += view.world_to_camera[:3, 3]
     x, y, z = camera[camera[:, 2] > 0].T

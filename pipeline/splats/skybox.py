@@ -2,8 +2,8 @@
 "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets").
 
 They become the sky. Where no photograph looks they stay as they are: the colour of the nearest
-points instead of a hole. Of a scene without sky, training changes only their colours (a fill): they
-would become surfaces at a wrong depth. Uses numpy and scipy, not torch.
+points instead of a hole. Of a scene without sky, training leaves all of them as they are, the fill:
+they would become surfaces at a wrong depth. Uses numpy and scipy, not torch.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from pipeline.splats.gaussians import Gaussians, resize_bands
 BETA2 = 0.999
 # As in 3DGS: gradients of a mean over all pixels are far below the usual 1e-8.
 EPSILON = 1e-15
-# The second moment of what is frozen. Steps are gradients divided by its root: they round to 0, also
+# The second moment of frozen rows. Steps are gradients divided by its root: they round to 0, also
 # after it has decayed for a whole schedule. Other second moments are far below FROZEN_ABOVE.
 FROZEN, FROZEN_ABOVE = 1e30, 1e10
 
@@ -162,13 +162,13 @@ class Adam:
 
     @property
     def frozen(self) -> Tensor:
-        """(N,) bool, the rows of which steps change only the constant colour."""
+        """(N,) bool, the rows that steps do not change."""
         return self.second["opacity_logits"] > FROZEN_ABOVE
 
     def freeze(self, rows: Tensor) -> None:
-        """Let steps change only the constant colour of ``rows``, (N,) bool."""
-        for name, moments in self.second.items():
-            (moments[:, 1:] if name == "sh" else moments)[rows] = FROZEN
+        """Keep ``rows``, (N,) bool, as they are in all steps."""
+        for moments in self.second.values():
+            moments[rows] = FROZEN
 
     def forget(self, name: str) -> None:
         """Zero the moments of one array."""

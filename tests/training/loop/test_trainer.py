@@ -113,11 +113,9 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
 
 
 @pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
-def test_training_changes_only_the_colours_of_a_fill(
-    scene: TinyScene, tmp_path: Path, strategy: str
-) -> None:
-    """Photographs show it between the other Gaussians, through opacity resets, density control and
-    a rise of the SH degree. A skybox moves."""
+def test_training_leaves_a_fill_as_it_is(scene: TinyScene, tmp_path: Path, strategy: str) -> None:
+    """All photographs see it between the other Gaussians, through opacity resets, density control,
+    a rise of the SH degree and an interruption. A skybox changes."""
     centres = np.array([view.centre for view in scene.views])
     arrays = {
         name: tensor.numpy() for name, tensor in scene.initial.with_sh_degree(0).tensors().items()
@@ -144,10 +142,7 @@ def test_training_changes_only_the_colours_of_a_fill(
     assert len(fill) == NUM_GAUSSIANS
     order = {tuple(mean): row for row, mean in enumerate(initial.means.tolist())}
     same = initial.select(torch.tensor([order[tuple(mean)] for mean in fill.means.tolist()]))
-    same = same.with_sh_degree(options.sh_degree)
-    assert not torch.allclose(same.sh[:, 0], fill.sh[:, 0], atol=1e-3)
-    same.sh[:, 0] = fill.sh[:, 0]
-    for name, tensor in same.tensors().items():
+    for name, tensor in same.with_sh_degree(options.sh_degree).tensors().items():
         assert torch.allclose(tensor, fill.tensors()[name], rtol=0.0, atol=1e-9), name
     assert len(kept("skybox")) < NUM_GAUSSIANS
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from pathlib import Path
+from typing import ClassVar, TypeVar
 
+from pipeline.config.schema import Train
 from pipeline.config.settled import Background
 from pipeline.runtime.json_file import JsonFile
+
+T = TypeVar("T", bound=Train)
 
 
 class SceneBackground(JsonFile):
@@ -20,3 +24,18 @@ class SceneBackground(JsonFile):
 
     background: Background
     reason: str
+
+
+def with_background(train: T, folder: Path) -> T:
+    """The options of training, with the background that the stage ``init`` decided on.
+
+    Args:
+        folder: The folder of the stage ``init``, or of a stage that trains.
+
+    Raises:
+        UserError: The file is missing or damaged.
+    """
+    if train.background != "measured":
+        return train
+    found = SceneBackground.read(folder).background
+    return train.model_copy(update={"background": found})

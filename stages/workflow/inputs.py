@@ -11,7 +11,7 @@ from pipeline.config.settled import Train
 from pipeline.io.colmap import has_model, read_model
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
-from pipeline.scene.background import SceneBackground
+from pipeline.scene.background import SceneBackground, with_background
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import Normalization
@@ -81,13 +81,16 @@ def trained_model(job: Job, role: str = "train", *, points: bool = True) -> Reco
 
 def drawing(job: Job) -> Train:
     """The options of training, with the background that the stage ``init`` decided on."""
-    background = scene_background(job).background
-    return job.section(Train).model_copy(update={"background": background})
+    return with_background(job.section(Train), _background_folder(job))
 
 
-def scene_background(job: Job) -> SceneBackground:
-    """The background that the stage ``init`` decided on."""
-    return SceneBackground.read(next(job.inputs[role] for role in BACKGROUND if role in job.inputs))
+def copy_background(job: Job) -> None:
+    """Copy what ``init`` decided about the background, for later stages."""
+    shutil.copy(_background_folder(job) / SceneBackground.file_name, job.out)
+
+
+def _background_folder(job: Job) -> Path:
+    return next(job.inputs[role] for role in BACKGROUND if role in job.inputs)
 
 
 def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:
@@ -106,7 +109,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
         write_model(job.out / "sparse" / "0", trained.model)
     trained.result.curve.write(job.out)
     trained.gains.write(job.out)
-    scene_background(job).write(job.out)
+    copy_background(job)
     if trained.result.appearance is not None:
         write_appearance(job.out, trained.result.appearance)
     job.record(trained.counters, trained.decisions, trained.warnings)

@@ -66,7 +66,6 @@ def work(job: Job) -> None:
     from pipeline.photos.cloud import NOT_PLACED, placed_points
     from pipeline.sfm.triangulation import TriangulationOptions, triangulate
     from pipeline.splats.first import InitPoints, first_gaussians
-    from pipeline.splats.skybox import SKYBOXES
 
     config, experiments = job.section(Init), job.section(Experiments)
     training = inputs.training_views(job)
@@ -110,7 +109,7 @@ def work(job: Job) -> None:
         config,
         experiments.init,
         job.seed,
-        skybox=background.background in SKYBOXES,
+        background=background.background,
     )
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)

@@ -19,7 +19,7 @@ from pipeline.runtime.memory import freed_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
-from pipeline.splats.skybox import SKYBOXES, Sky, untrained
+from pipeline.splats.skybox import SKYBOXES, Sky, of_fill
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
@@ -131,8 +131,8 @@ def initial_state(
     cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, options)
     order = rng.permutation(len(scene.views))
     adam = Adam(gaussians, AdamOptions.of(options), backend)
-    if options.background == "fill":
-        adam.freeze(torch.from_numpy(untrained(gaussians.opacity_logits.numpy())))
+    if scene.sky is not None:
+        adam.freeze(torch.from_numpy(of_fill(gaussians.opacity_logits.numpy())))
     return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
 
 

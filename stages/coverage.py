@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Split
-from pipeline.config.settled import Train
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -27,7 +26,7 @@ def work(job: Job) -> None:
     from pipeline.metrics.protocol import choose_protocol
     from pipeline.render.registry import use_device
 
-    views, train = inputs.trained_views(job), job.section(Train)
+    views, train = inputs.trained_views(job), inputs.drawing(job)
     use_device(train.device)
     protocol = choose_protocol(views, job.section(Split), train)
     measure_coverage(

@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Evaluate, Split
-from pipeline.config.settled import Train
 from pipeline.metrics.counters import EvaluateCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
@@ -44,7 +43,7 @@ def work(job: Job) -> None:
     from pipeline.render.registry import use_device
     from pipeline.scene.exposure import ExposureGains
 
-    train, views = job.section(Train), inputs.trained_views(job)
+    train, views = inputs.drawing(job), inputs.trained_views(job)
     use_device(train.device)
     protocol = choose_protocol(views, job.section(Split), train)
     gaussians = inputs.trained_gaussians(job)

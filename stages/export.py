@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Views
 from pipeline.config.section import MAX_SIDE_PX
-from pipeline.config.settled import Train
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec
@@ -42,7 +41,8 @@ def work(job: Job) -> None:
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
-    use_device(job.section(Train).device)
+    train = inputs.drawing(job)
+    use_device(train.device)
     manifest, model, split = (
         inputs.read_manifest(job, "views"),
         inputs.trained_model(job),
@@ -65,7 +65,7 @@ def work(job: Job) -> None:
         scene,
         job.section(Export),
         job.section(Experiments).export,
-        job.section(Train),
+        train,
         split,
         threads=job.threads,
     )

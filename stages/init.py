@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.mvs.initial import SurfacePoints
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.scene.background import SceneBackground
     from pipeline.scene.reconstruction import Points
     from pipeline.scene.views import View
 
@@ -69,7 +70,7 @@ def work(job: Job) -> None:
 
     config, experiments = job.section(Init), job.section(Experiments)
     training = inputs.training_views(job)
-    points = inputs.input_model(job).points
+    points = sparse = inputs.input_model(job).points
     extra, source, normals = {}, "points", None
     dense = _dense_points(job, points, training, config) if config.method == "dense" else None
     cloud = read_cloud(job.inputs["inspect"]) if config.method == "points" else None
@@ -100,16 +101,38 @@ def work(job: Job) -> None:
         job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated).points
         extra = {"triangulated_points": len(points)}
+    background = _background(job, training, sparse if len(sparse) else points)
+    job.decide(background.reason)
+    background.write(job.out)
     first = first_gaussians(
         InitPoints(points, source, normals),
         training,
         config,
         experiments.init,
         job.seed,
-        skybox=job.section(Train).background == "skybox",
+        background=background.background,
     )
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
+
+
+def _background(job: Job, training: list[View], points: Points) -> SceneBackground:
+    import numpy as np
+
+    from pipeline.geometry.up_direction import up_direction
+    from pipeline.photos.backdrop import choose_background, measure_evidence
+    from pipeline.scene.background import SceneBackground
+
+    configured = job.section(Train).background
+    if configured != "measured":
+        return SceneBackground(background=configured, reason=f"{configured} background")
+    photos = inputs.read_manifest(job, "views").photos
+    orientations = {photo.name: photo.orientation for photo in photos}
+    up = up_direction(
+        np.stack([view.world_to_camera[:3, :3] for view in training]),
+        [orientations[view.name] for view in training],
+    )
+    return choose_background(measure_evidence(training, points.xyz, up))
 
 
 def _dense_points(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Split
-from pipeline.config.settled import Train
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -35,7 +34,7 @@ def work(job: Job) -> None:
     from pipeline.scene.georeference import Georeference
 
     start = time.perf_counter()
-    views, train = inputs.trained_views(job), job.section(Train)
+    views, train = inputs.trained_views(job), inputs.drawing(job)
     plan = PlanRecord.model_validate(job.key["plan"])
     evaluation = Evaluation.read_for(job.inputs["evaluate"], [view.name for view in views])
     results = job.inputs["inspect"].parent

@@ -274,12 +274,14 @@ class Train(Section):
         "cluster.",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the spherical harmonics.")
-    background: Literal["auto", "skybox", "black", "white", "random"] = Field(
+    background: Literal["auto", "measured", "skybox", "fill", "black", "white", "random"] = Field(
         "auto",
         description="What is behind the scene. skybox: Gaussians on a distant sphere, which become "
-        "the sky and fill what no photograph shows; random: another colour in each step; auto: "
-        "white if images have alpha, black if there are masks or with strategy: original, else "
-        "skybox.",
+        "the sky and fill what no photograph shows; fill: the same in the colours of the nearest "
+        "points, which training leaves as they are; random: another colour in each step; measured: "
+        "skybox if the photographs show sky, black or white if that is the backdrop's colour, "
+        "black if masks leave an object that stands alone, else fill; auto: white if most images "
+        "have alpha, black if some have or with strategy: original, else measured.",
     )
     appearance: Literal["measured", "none", "exposure", "embedding"] = Field(
         "measured",
@@ -317,7 +319,7 @@ class Train(Section):
     mask_loss_weight: LossWeight = Field(
         0.1,
         description="Weight of the rendered alpha of pixels that a mask excludes, relative to the "
-        "colour loss. 0: no loss on these pixels.",
+        "colour loss. 0, or background: skybox or fill: no loss on these pixels.",
     )
     density: Density = Field(default_factory=Gradient)
 

@@ -23,7 +23,7 @@ CameraModel = Literal[
     "OPENCV_FISHEYE",
     "EQUIRECTANGULAR",
 ]
-Background = Literal["skybox", "black", "white", "random"]
+Background = Literal["measured", "skybox", "fill", "black", "white", "random"]
 Device = Annotated[str, Field(pattern=r"^(cpu|gpu(:[0-9]{1,3})?)$")]
 
 

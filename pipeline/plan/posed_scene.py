@@ -20,6 +20,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.json_file import first_error, mismatch
 from pipeline.runtime.layout import rerun_command
 from pipeline.runtime.record import STAGE, read_stage
+from pipeline.scene.background import with_background
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
@@ -143,7 +144,8 @@ def _finished(
     ]
     gains = ExposureGains.read_for(trained, [view.name for view in found])
     up = scene_up(found, manifest)
-    return PosedScene(found, split, settings.train, gains, (), up, unit)
+    train = with_background(settings.train, trained)
+    return PosedScene(found, split, train, gains, (), up, unit)
 
 
 def _in_unit(

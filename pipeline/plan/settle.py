@@ -232,11 +232,12 @@ def _background(scan: Scan, config: Config) -> Choice:
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
     if scan.num_alpha:
         return "black", f"black background: only {scan.num_alpha} photographs have alpha"
-    if scan.num_masks:
-        return "black", "black background: masks exclude what is behind the scene"
     if config.train.density.strategy == "original":
         return "black", "black background, as published"
-    return "skybox", "a skybox behind the scene: neither alpha nor masks"
+    return "measured", (
+        "behind the scene, what init finds in the photographs: a skybox if they show sky, the "
+        "colour of a backdrop, else a fill"
+    )
 
 
 def _georeference(scan: Scan, config: Config) -> str:

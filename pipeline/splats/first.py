@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import InitExperiments
-from pipeline.config.settled import Init
+from pipeline.config.settled import Background, Init
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.counters import InitCounters
 from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
-from pipeline.splats.skybox import NUM_GAUSSIANS, with_skybox
+from pipeline.splats.skybox import SKYBOXES, with_skybox
 
 # With fewer sparse points than this, Gaussians are initialised at random.
 MIN_POINTS = 100
@@ -50,7 +50,7 @@ def first_gaussians(
     config: Init,
     experiments: InitExperiments,
     seed: int,
-    skybox: bool = False,
+    background: Background = "black",
 ) -> FirstGaussians:
     """Initialise Gaussians from points, or at random if ``config.method`` is
     "random" or there are fewer than ``MIN_POINTS``.
@@ -58,7 +58,8 @@ def first_gaussians(
     Args:
         training: The training views, for random initialisation and the scale of the scene.
         seed: The seed of random initialisation.
-        skybox: Whether to add a skybox behind the Gaussians (``pipeline.splats.skybox``).
+        background: What is behind the Gaussians: for "skybox" and "fill", more of them
+            (``pipeline.splats.skybox``).
     """
     points, source = init.points, init.source
     method, warnings = config.method, []
@@ -72,9 +73,10 @@ def first_gaussians(
         first = gaussians_from_points(points, centres, config, 0, experiments, init.normals)
     source = "random positions" if method == "random" else source
     decisions = [f"{len(first)} Gaussians from {source}"]
-    if skybox:
-        first = with_skybox(first, centres)
-        decisions.append(f"{NUM_GAUSSIANS} Gaussians of a skybox behind them")
+    if background in SKYBOXES:
+        count = len(first)
+        first = with_skybox(first, centres, trained=background == "skybox")
+        decisions.append(f"{len(first) - count} Gaussians of a {background} behind them")
     counters = InitCounters(
         num_gaussians=len(first),
         points=len(points),

@@ -1,8 +1,10 @@
 """Gaussians on a sphere around the scene, behind all others (a skybox, as in Kerbl et al. 2024,
 "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets").
 
-They become the sky. Where no photograph looks they stay as they are: the colour of the nearest
-points instead of a hole. Uses numpy and scipy, not torch.
+They become the sky. Behind them is the same again, the fill, which training leaves as it is: the
+colour of the nearest points instead of a hole where no photograph looks, or where training shrinks
+the sky at the edges of photographs. Scenes without sky have only the fill, since a skybox would
+become surfaces at a wrong depth. Uses numpy and scipy, not torch.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from pipeline.splats.init import (
     rotations_to,
 )
 
+# The backgrounds that are a skybox.
+SKYBOXES = ("skybox", "fill")
 # Number of Gaussians: one every 9 degrees, which density control splits where sky has detail.
 NUM_GAUSSIANS = 500
 # The radius is RADIUS times this quantile of the depths of the points.
@@ -35,15 +39,21 @@ SKY_DISTANCE = 5.0
 SPREAD = 0.7
 # The skybox must hide the background from the first step on.
 OPACITY = 0.95
+# The fill is farther away by this factor. It is recognised by its opacity, which other Gaussians do
+# not start with.
+FILL_RADIUS, FILL_OPACITY = 2.0, 0.951
 # The colour of a Gaussian is a mean over this many points, the nearest in direction.
 NUM_POINTS = 16
 
 
-def with_skybox(gaussians: InitGaussians, camera_centres: NDArray[np.float64]) -> InitGaussians:
+def with_skybox(
+    gaussians: InitGaussians, camera_centres: NDArray[np.float64], *, trained: bool = True
+) -> InitGaussians:
     """The Gaussians, followed by those of a skybox, flat along the rays from its centre.
 
     Args:
         camera_centres: (C, 3) float64 in world coordinates.
+        trained: Whether there is a skybox to train before the fill.
     """
     xyz = gaussians.means.astype(np.float64)
     centre = camera_centres.mean(0)
@@ -52,18 +62,17 @@ def with_skybox(gaussians: InitGaussians, camera_centres: NDArray[np.float64]) -
     radius = RADIUS * max(depth, outermost, MIN_DEPTH)
     directions = fibonacci_sphere(NUM_GAUSSIANS)
     colours = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0].astype(np.float64), 0, 1)
-    scale = np.full(NUM_GAUSSIANS, SPREAD * radius * np.sqrt(4 * np.pi / NUM_GAUSSIANS))
-    sky = isotropic(
-        centre + radius * directions,
-        scale,
-        colours_towards(directions, centre, xyz, colours),
-        OPACITY,
-        gaussians.sh_degree,
-    )
-    sky.quats[:] = rotations_to(directions)
-    sky.log_scales[:, 0] += np.float32(np.log(FLATNESS))
-    arrays, added = gaussians.arrays(), sky.arrays()
-    both = {name: np.concatenate([arrays[name], added[name]]) for name in NAMES}
+    seen = colours_towards(directions, centre, xyz, colours)
+    parts = [gaussians.arrays()]
+    for far, opacity in ((1.0, OPACITY), (FILL_RADIUS, FILL_OPACITY))[not trained :]:
+        scale = np.full(NUM_GAUSSIANS, SPREAD * far * radius * np.sqrt(4 * np.pi / NUM_GAUSSIANS))
+        sky = isotropic(
+            centre + far * radius * directions, scale, seen, opacity, gaussians.sh_degree
+        )
+        sky.quats[:] = rotations_to(directions)
+        sky.log_scales[:, 0] += np.float32(np.log(FLATNESS))
+        parts.append(sky.arrays())
+    both = {name: np.concatenate([part[name] for part in parts]) for name in NAMES}
     return InitGaussians(
         **both, num_dropped=gaussians.num_dropped, num_thinned=gaussians.num_thinned
     )
@@ -94,6 +103,11 @@ class Sky:
         total = np.cumsum(np.ones(len(order)) if weights is None else weights[order])
         middle = distance[order[np.searchsorted(total, 0.5 * total[-1])]]
         return np.asarray(distance > SKY_DISTANCE * middle)
+
+
+def of_fill(opacity_logits: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(N,) whether Gaussians are of the fill, by their opacity."""
+    return np.asarray(opacity_logits == np.float32(np.log(FILL_OPACITY / (1 - FILL_OPACITY))))
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

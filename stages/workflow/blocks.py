@@ -91,6 +91,7 @@ def unite(job: Job) -> None:
     if has_model(coarse / "sparse" / "0"):
         shutil.copytree(coarse / "sparse", job.out / "sparse")
     shutil.copy(coarse / ExposureGains.file_name, job.out)
+    inputs.copy_background(job)
     numbers = range(1, len(read_partition(job).blocks) + 1)
     folders = [job.inputs[f"polish_{number}"] for number in numbers]
     curve = joined_curve([TrainingCurve.read(folder) for folder in folders])

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Split, Views
+from pipeline.config.settled import Train
 from pipeline.io.colmap import has_model, read_model
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
+from pipeline.scene.background import SceneBackground, with_background
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import Normalization
@@ -30,6 +32,8 @@ MODEL = ("undistort", *POSES)
 # Inputs of the stages after training.
 TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
+# Roles of stages whose folder has the scene's background, the latest in the DAG first.
+BACKGROUND = ("train", "coarse", "init")
 # Options that rendering outside of training depends on.
 DRAWING_OPTIONS = ("train.device", "train.sh_degree", "train.antialias", "train.background")
 
@@ -75,6 +79,20 @@ def trained_model(job: Job, role: str = "train", *, points: bool = True) -> Reco
     return read_model(refined, points=points)
 
 
+def drawing(job: Job) -> Train:
+    """The options of training, with the background that the stage ``init`` decided on."""
+    return with_background(job.section(Train), _background_folder(job))
+
+
+def copy_background(job: Job) -> None:
+    """Copy what ``init`` decided about the background, for later stages."""
+    shutil.copy(_background_folder(job) / SceneBackground.file_name, job.out)
+
+
+def _background_folder(job: Job) -> Path:
+    return next(job.inputs[role] for role in BACKGROUND if role in job.inputs)
+
+
 def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:
     """Write the outputs of a training, and record what it counted and decided.
 
@@ -91,6 +109,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
         write_model(job.out / "sparse" / "0", trained.model)
     trained.result.curve.write(job.out)
     trained.gains.write(job.out)
+    copy_background(job)
     if trained.result.appearance is not None:
         write_appearance(job.out, trained.result.appearance)
     job.record(trained.counters, trained.decisions, trained.warnings)

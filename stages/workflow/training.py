@@ -4,7 +4,7 @@ would change with the code of training."""
 from __future__ import annotations
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.settled import Train, TrainOptions
+from pipeline.config.settled import TrainOptions
 from pipeline.render.registry import use_device
 from pipeline.runtime.job import Job
 from pipeline.training.run import WHOLE_RUN, Part, TrainingRun
@@ -14,7 +14,7 @@ from stages.workflow import inputs
 
 def training_run(job: Job, part: Part = WHOLE_RUN) -> TrainingRun:
     """The run of a job that trains ``part`` of the schedule."""
-    options = TrainOptions(**dict(job.section(Train)), experiments=job.section(Experiments).train)
+    options = TrainOptions(**dict(inputs.drawing(job)), experiments=job.section(Experiments).train)
     use_device(options.device)
     return TrainingRun(
         options,

@@ -126,10 +126,11 @@ def test_options_are_settled(tmp_path):
     assert config.inspect.image_folder == "images"
     assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
     assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
-    assert (config.init.method, config.train.background) == ("dense", "skybox")
+    assert (config.init.method, config.train.background) == ("dense", "measured")
 
 
-def test_no_skybox_behind_masks_alpha_or_the_published_method(tmp_path):
+def test_photographs_decide_on_the_background_unless_it_is_known_before(tmp_path):
+    """A mask may hide a passer-by, so masks are measured as well."""
     photos(tmp_path / "images", 2)
     original = plan_of(tmp_path, train={"density": {"strategy": "original"}})
     assert original.config.train.background == "black"
@@ -139,8 +140,9 @@ def test_no_skybox_behind_masks_alpha_or_the_published_method(tmp_path):
     (tmp_path / "masks").mkdir()
     first = min((tmp_path / "images").iterdir()).stem
     picture(tmp_path / "masks" / f"{first}.png", mode="L")
-    assert plan_of(tmp_path).config.train.background == "black"
-    assert plan_of(tmp_path, views={"masks": "ignore"}).config.train.background == "skybox"
+    plan = plan_of(tmp_path)
+    assert plan.config.train.background == "measured"
+    assert any("a skybox if they show sky" in text for text in plan.stages["train"].decisions)
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,7 @@ def under(**options: Any) -> dict[str, Any]:
         "train": {
             "steps": 40,
             "appearance": "none",  # measuring exposures takes as long as these steps
+            "background": "black",  # a fill would take most of these Gaussians
             "density": {"strategy": "gradient", "max_gaussians": 600},
         },
     }

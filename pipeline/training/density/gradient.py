@@ -92,7 +92,7 @@ class GradientDensity(Strategy):
         split = torch.zeros_like(kept)
         if self.densifies_after(step.steps):
             gradient = self.observed.mean()
-            candidates = kept & (gradient > self.options.grad_threshold)
+            candidates = kept & (gradient > self.options.grad_threshold) & ~step.adam.frozen
             kept = kept & ~self._recycled(step, kept, gradient, candidates)
             # Each split adds one Gaussian.
             split = highest(gradient, candidates & kept, max(0, step.budget - int(kept.sum())))
@@ -103,7 +103,7 @@ class GradientDensity(Strategy):
         return result.gaussians, result.changes
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        limit_opacity(gaussians, adam, unlimited=self._sky(gaussians))
+        limit_opacity(gaussians, adam, unlimited=self._sky(gaussians, adam))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         return self.observed.arrays()
@@ -117,13 +117,13 @@ class GradientDensity(Strategy):
         useless = torch.sigmoid(gaussians.opacity_logits) < self.options.prune_opacity
         if any(map(self.prunes_large_after, step.steps)):
             large = longest_scale(gaussians) > self.options.prune_scale * self.scale
-            useless |= large & ~self._sky(gaussians)
+            useless |= large & ~self._sky(gaussians, step.adam)
         return useless | not_finite(gaussians)
 
-    def _sky(self, gaussians: Gaussians) -> Tensor:
+    def _sky(self, gaussians: Gaussians, adam: Adam) -> Tensor:
         if self.sky is None:
-            return torch.zeros(len(gaussians), dtype=torch.bool)
-        return torch.from_numpy(self.sky.contains(gaussians.means.numpy()))
+            return adam.frozen
+        return adam.frozen | torch.from_numpy(self.sky.contains(gaussians.means.numpy()))
 
     def _recycled(
         self, step: DensityStep, kept: Tensor, gradient: Tensor, candidates: Tensor

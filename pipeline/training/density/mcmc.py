@@ -104,13 +104,14 @@ class McmcDensity(Strategy):
         useless |= not_finite(gaussians)
         alive = torch.nonzero(~useless)[:, 0]
         dead = int(useless.sum())
-        if not self.densifies_after(step.steps) or not len(alive):
+        opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double()
+        weights = opacity.masked_fill(adam.frozen[alive], 0.0).numpy()
+        if not self.densifies_after(step.steps) or not weights.any():
             adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
             return gaussians.select(alive), Changes(pruned=dead)
         grown = min(step.budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
         added = max(0, grown - len(gaussians))
-        opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double().numpy()
-        chosen = step.rng.choice(len(alive), size=dead + added, p=opacity / opacity.sum())
+        chosen = step.rng.choice(len(alive), size=dead + added, p=weights / weights.sum())
         copies = torch.from_numpy(np.bincount(chosen, minlength=len(alive)))
         sources = alive[torch.from_numpy(np.sort(chosen))]
         shared = gaussians.clone()

@@ -19,7 +19,7 @@ from pipeline.runtime.memory import freed_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
-from pipeline.splats.skybox import Sky
+from pipeline.splats.skybox import SKYBOXES, Sky, of_fill
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
@@ -43,7 +43,7 @@ class TrainingScene:
         gains: (V, 3) float32 factors of the renders, or None.
         background: The background: black, white or random.
         near: The near plane, world units.
-        sky: None without a skybox.
+        sky: The skybox, None without one.
     """
 
     inputs: Inputs
@@ -79,7 +79,7 @@ def load_scene(inputs: Inputs, run: TrainingRun, warn: Warn) -> TrainingScene:
     near = near_plane(inputs.extent)
     inputs = _without_hidden_views(inputs, targets, warn)
     background, sky = run.options.background, None
-    if background == "skybox":
+    if background in SKYBOXES:
         background = "black"  # Behind the Gaussians of the skybox.
         sky = Sky(np.array([view.centre for view in inputs.views]))
     gains = None if inputs.gains is None else torch.from_numpy(inputs.gains.astype(np.float32))
@@ -131,6 +131,8 @@ def initial_state(
     cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, options)
     order = rng.permutation(len(scene.views))
     adam = Adam(gaussians, AdamOptions.of(options), backend)
+    if scene.sky is not None:
+        adam.freeze(torch.from_numpy(of_fill(gaussians.opacity_logits.numpy())))
     return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
 
 

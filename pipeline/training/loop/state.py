@@ -123,9 +123,9 @@ class TrainState:
         before = self.step - 2 * views + 1
         seen = self.adam.last > before
         if before > 0 and seen.any():
-            kept = seen
+            kept = seen | self.adam.frozen
             if sky is not None:
-                kept = seen | torch.from_numpy(sky.contains(self.gaussians.means.numpy()))
+                kept |= torch.from_numpy(sky.contains(self.gaussians.means.numpy()))
             self.counters.unseen = int((~kept).sum())
             self.gaussians = self.gaussians.select(torch.nonzero(kept)[:, 0])
 

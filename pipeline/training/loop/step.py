@@ -92,7 +92,8 @@ def plane_losses(scene: TrainingScene, run: TrainingRun) -> Sequence[PlaneLoss]:
     options, depths = run.options, scene.inputs.depths
     losses: list[PlaneLoss] = [
         AlphaLoss(
-            options.mask_loss_weight,
+            # Before a skybox, masks hide what is in the way, and leave no empty space.
+            options.mask_loss_weight if scene.sky is None else 0.0,
             options.experiments.alpha_loss_weight,
             options.experiments.squared_error_loss_weight,
         )

@@ -27,6 +27,9 @@ from pipeline.splats.gaussians import Gaussians, resize_bands
 BETA2 = 0.999
 # As in 3DGS: gradients of a mean over all pixels are far below the usual 1e-8.
 EPSILON = 1e-15
+# The second moment of frozen rows. Steps are gradients divided by its root: they round to 0, also
+# after it has decayed for a whole schedule. Other second moments are far below FROZEN_ABOVE.
+FROZEN, FROZEN_ABOVE = 1e30, 1e10
 
 
 @dataclass(frozen=True)
@@ -157,12 +160,25 @@ class Adam:
                 moments[name][fresh] = 0.0
         self.last = self.last[rows]
 
+    @property
+    def frozen(self) -> Tensor:
+        """(N,) bool, the rows that steps do not change."""
+        return self.second["opacity_logits"] > FROZEN_ABOVE
+
+    def freeze(self, rows: Tensor) -> None:
+        """Keep ``rows``, (N,) bool, as they are in all steps."""
+        for moments in self.second.values():
+            moments[rows] = FROZEN
+
     def forget(self, name: str) -> None:
         """Zero the moments of one array."""
+        frozen = self.frozen
         self.first[name].zero_()
         self.second[name].zero_()
+        self.freeze(frozen)
 
     def resize_bands(self, degree: int) -> None:
         """Resize the moments as ``Gaussians.with_sh_degree`` does."""
         for moments in (self.first, self.second):
             moments["sh"] = resize_bands(moments["sh"], degree)
+        self.freeze(self.frozen)

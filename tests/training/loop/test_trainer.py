@@ -20,6 +20,9 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import InitGaussians
+from pipeline.splats.skybox import NUM_GAUSSIANS, with_skybox
 from pipeline.training.checkpoints.checkpoint import PATTERN
 from pipeline.training.data import targets
 from pipeline.training.data.image_store import DiskStore, MemoryStore
@@ -107,6 +110,35 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
     steps = 2 * len(scene.views) - 1
     short = run(planted, tmp_path / "b", fixed.model_copy(update={"steps": steps}))
     assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
+def test_training_changes_a_skybox_but_not_the_fill_behind_it(
+    scene: TinyScene, tmp_path: Path, strategy: str
+) -> None:
+    """All photographs see it between the other Gaussians, through opacity resets, density control
+    and a rise of the SH degree."""
+    centres = np.array([view.centre for view in scene.views])
+    points = scene.initial.with_sh_degree(0).tensors().items()
+    arrays = InitGaussians(**{name: tensor.numpy() for name, tensor in points})
+    shells = with_skybox(arrays, centres).arrays().items()
+    initial = Gaussians(**{name: torch.from_numpy(array) for name, array in shells})
+    options = tiny_config(
+        60,
+        density={"strategy": strategy, "max_gaussians": 1500, "opacity_reset_interval": 3000},
+        sh_degree_interval=1000,
+        background="skybox",
+    )
+    trained = run(replace(scene, initial=initial), tmp_path, options)
+    assert trained.counters["changes"]["split"] + trained.counters["changes"]["cloned"] > 0
+    found = {tuple(mean): row for row, mean in enumerate(trained.gaussians.means.tolist())}
+    sky, fill = initial.means[-2 * NUM_GAUSSIANS :].split(NUM_GAUSSIANS)
+    assert not all(tuple(mean) in found for mean in sky.tolist())
+    rows = torch.tensor([found[tuple(mean)] for mean in fill.tolist()])
+    expected = initial.select(torch.arange(len(initial) - NUM_GAUSSIANS, len(initial)))
+    kept = trained.gaussians.select(rows).tensors()
+    for name, tensor in expected.with_sh_degree(options.sh_degree).tensors().items():
+        assert torch.allclose(tensor, kept[name], rtol=0.0, atol=1e-9), name
 
 
 def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from pipeline.config.settled import TrainOptions
 
 # Up to so many training views, SHARE of the Gaussians is dropped at the end of the run.
-FEW_VIEWS, SHARE = 12, 0.2
+FEW_VIEWS, SHARE = 26, 0.2
 # The logit of a Gaussian that is not drawn.
 DROPPED_LOGIT = -20.0
 # Upper bound of raised opacities, as of all in training.

@@ -18,9 +18,12 @@ import torch
 from torch import Tensor
 
 from pipeline.config.settled import TrainOptions
+from pipeline.training.density.timeline import schedule_length
 
 # Up to so many training views, SHARE of the Gaussians is dropped at the end of the run.
 FEW_VIEWS, SHARE = 26, 0.2
+# Runs of fewer epochs do not overfit.
+MIN_EPOCHS = 50
 # The logit of a Gaussian that is not drawn.
 DROPPED_LOGIT = -20.0
 # Upper bound of raised opacities, as of all in training.
@@ -47,7 +50,8 @@ def dropout_of(options: TrainOptions, views: int) -> float:
     share = options.experiments.dropout
     if share is None:
         refined = options.refine_poses or options.refine_intrinsics
-        share = SHARE if views <= FEW_VIEWS and not refined else 0.0
+        overfits = views <= FEW_VIEWS and schedule_length(options) >= MIN_EPOCHS * views
+        share = SHARE if overfits and not refined else 0.0
     return share
 
 

@@ -55,6 +55,7 @@ def test_only_few_training_views_drop_gaussians() -> None:
     assert dropout_of(options_of(), 3) == dropout_of(options_of(), FEW_VIEWS) == SHARE
     assert dropout_of(options_of(), FEW_VIEWS + 1) == 0
     assert dropout_of(options_of().model_copy(update={"refine_poses": True}), 3) == 0
+    assert dropout_of(options_of().model_copy(update={"steps": 50 * 17 - 1}), 17) == 0
     assert dropout_of(options_of(dropout=0.0), 3) == 0
     assert dropout_of(options_of(dropout=0.5), 100) == 0.5
     assert Schedule.of(options_of(), views=3).dropped_share_at(Train().steps) == SHARE

@@ -19,6 +19,7 @@ from pipeline.plan.record import read_plan
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.errors import UserError
+from pipeline.scene.background import SceneBackground
 from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.georeference import Georeference
 from pipeline.training.loop.curve import TrainingCurve
@@ -94,7 +95,10 @@ def test_counters_and_plan_fit_their_models(finished, tmp_path):
 
 # Files that others read with their own models, or that have another program's format.
 RECORDS = {"stage.json", ".stage.json", "run.json", "images.json", "transforms.json"}
-MODELS = (Metrics, Evaluation, CoverageRecord, Georeference, Frame, TrainingCurve, ExposureGains)
+MODELS = (
+    *(Metrics, Evaluation, CoverageRecord, Georeference, Frame, TrainingCurve, ExposureGains),
+    SceneBackground,
+)
 
 
 def test_every_json_file_of_a_stage_is_what_its_model_writes(finished, tmp_path):

@@ -119,7 +119,8 @@ def lit(gaussians, colour):
     """A wall in front of the camera, of this display value."""
     wall = Gaussians.from_arrays(gaussians.arrays())
     wall.means[:] = torch.tensor([0.0, 0.0, 3.0])
-    wall.log_scales[:] = 3.0
+    wall.log_scales[:] = torch.tensor([3.0, 3.0, -3.0])
+    wall.quats[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     wall.opacity_logits[:] = 12.0
     wall.sh[:] = (colour - 0.5) / SH_C0
     return wall

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from pipeline.demo.cameras import LENSES, PATHS
+from pipeline.demo.cameras import LENSES
 from pipeline.demo.options import picture_size
 from pipeline.demo.write import DemoSpec, Format, Poses, write_demo
 from pipeline.runtime.errors import UserError
@@ -31,12 +31,6 @@ def main(arguments: list[str] | None = None) -> int:
     add("--alpha", action="store_true", help="objects alone, transparent ground (png)")
     add("--masks", action="store_true", help="a moving ball, and masks that leave it out")
     add("--noise", type=float, default=default.noise, help="read noise of dng, 14-bit steps")
-    add(
-        "--cameras",
-        choices=[*PATHS],
-        default=default.cameras,
-        help="around objects, or looking out",
-    )
     add("--seed", type=int, default=default.seed, help="another seed, other camera positions")
     add("--processes", type=int, help="number of views rendered at once; None is one per core")
     options = vars(parser.parse_args(arguments))

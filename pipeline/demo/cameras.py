@@ -67,25 +67,6 @@ def orbit(names: list[str], seed: int) -> list[PosedImage]:
     return posed
 
 
-def turning(names: list[str], seed: int) -> list[PosedImage]:
-    """Cameras in the middle of the room, above the objects, that turn once and look at its walls,
-    as one photographs a courtyard."""
-    rng = np.random.default_rng([seed, 3])
-    start = rng.uniform(0, 2 * np.pi)
-    posed = []
-    for i, name in enumerate(names):
-        angle = start + 2 * np.pi * i / len(names)
-        ahead = np.array([np.cos(angle), np.sin(angle), 0.0])
-        centre = 0.7 * ahead + np.array([0.0, 0.0, 1.5]) + rng.uniform(-0.35, 0.35, 3)
-        target = centre + 2.0 * ahead + rng.uniform(-0.3, 0.3, 3)
-        rotation = look_at(centre, target, roll=rng.uniform(-0.05, 0.05))
-        posed.append(PosedImage(name, 1, rotation, -rotation @ centre))
-    return posed
-
-
-PATHS = {"orbit": orbit, "turning": turning}
-
-
 def look_at(centre: Array, target: Array, roll: float = 0.0) -> Array:
     """(3, 3) world-to-camera rotation of a camera that looks at ``target``; roll in radians."""
     forward = (target - centre) / np.linalg.norm(target - centre)

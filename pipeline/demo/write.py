@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.demo.cameras import FISHEYE_HALF_ANGLE, LENSES, PATHS, WIDE, lens
+from pipeline.demo.cameras import FISHEYE_HALF_ANGLE, LENSES, WIDE, lens, orbit
 from pipeline.demo.output import (
     Poses,
     in_processes,
@@ -50,7 +50,6 @@ class DemoSpec:
         alpha: Whether the photographs are PNG with the objects alone on a transparent ground.
         masks: Whether the photographs show a moving ball, which masks/ leave out.
         noise: The read noise of RAW files in steps of 14 bits.
-        cameras: A key of ``pipeline.demo.cameras.PATHS``.
         seed: The seed of the camera positions, the points, the noise and the ball.
     """
 
@@ -64,7 +63,6 @@ class DemoSpec:
     alpha: bool = False
     masks: bool = False
     noise: float = 0.0
-    cameras: str = "orbit"
     seed: int = 0
 
     def check(self) -> None:
@@ -134,9 +132,7 @@ def _camera(spec: DemoSpec) -> Camera:
 
 
 def _views(spec: DemoSpec) -> list[PosedImage]:
-    return PATHS[spec.cameras](
-        [f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed
-    )
+    return orbit([f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed)
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.config.settled import Background
 from pipeline.photos.load import load_view
 from pipeline.scene.background import SceneBackground
-from pipeline.scene.views import View, resized, view_size
+from pipeline.scene.views import View, evenly_spaced, resized, view_size
 
 # The longer side of the reduced photographs, pixels, and the maximum number of them.
 SIDE, MAX_PICTURES = 160, 24
@@ -93,14 +93,13 @@ def measure_evidence(
     Raises:
         UserError: See ``photos.load.load_view``.
     """
-    count = min(MAX_PICTURES, len(views))
-    chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
+    chosen = evenly_spaced(views, MAX_PICTURES)
     pictures = [_picture(view) for view in chosen]
     xyz = xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
     borders, excluded = zip(*map(_border, pictures), strict=True)
     fixed, colour = _fixed(np.stack(borders))
     axes = np.stack([view.world_to_camera[2, :3] for view in chosen])
-    # Not a product of matrices, which may round differently with the number of threads.
+    # A matrix product of BLAS may round differently with the number of threads.
     cosine = np.einsum("ik,jk->ij", axes, axes).min()
     sky = sum(bool(sky_pixels(picture, xyz, up).any()) for picture in pictures)
     return Evidence(
@@ -108,7 +107,7 @@ def measure_evidence(
         fixed=fixed,
         colour=colour,
         turn=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-        sky=sky / count if sky >= MIN_SKY else 0.0,
+        sky=sky / len(chosen) if sky >= MIN_SKY else 0.0,
     )
 
 

@@ -47,6 +47,7 @@ def work(job: Job) -> None:
 
     from pipeline.io.npz import read_npz
     from pipeline.training.scene import train_scene
+    from stages.workflow.clear_places import with_clear_places
     from stages.workflow.training import scene_data, training_run
 
     trained = train_scene(
@@ -55,7 +56,7 @@ def work(job: Job) -> None:
         training_run(job),
         dense=job.inputs.get("dense"),
     )
-    inputs.write_trained(job, trained)
+    inputs.write_trained(job, with_clear_places(job, trained))
 
 
 SPEC = StageSpec(
@@ -77,6 +78,6 @@ SPEC = StageSpec(
     },
     optional=("coarse", "partition", "polish"),
     options=("train", "views", "split", "experiments.train"),
-    packages=("torch", "numpy", "opencv-contrib-python-headless"),
+    packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
     seeded=True,
 )

@@ -34,7 +34,8 @@ class FloaterRemoval(DensityControl):
         description="Remove Gaussians that are close to one camera, or to a hundredth of the "
         "cameras, which has most of their weight: at less than half the depth of its nearest "
         "sparse points. Only in runs of at least 50 epochs. At the end of any run, remove those "
-        "that would hide a view from between two neighbouring cameras.",
+        "that would hide a view from between two neighbouring cameras, or from a free place "
+        "beside, behind or above one.",
     )
 
 

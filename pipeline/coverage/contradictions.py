@@ -63,8 +63,7 @@ class NovelProbe:
     """A novel view, rendered.
 
     Attributes:
-        near: Half the distance of the nearest surface in view on which two training views agree,
-            world units; 0 if there is none.
+        near: See ``empty_depth``.
         beyond: (H, W, 3) the render without the Gaussians up to ``near``.
     """
 
@@ -159,14 +158,23 @@ def render_novel_views(
     """Render views at reduced size, one at a time."""
     agreed, means = training.surface.agreed(MIN_AGREEING), gaussians.arrays()["means"]
     for probe in render_probes(views, lambda view: render_view(gaussians, view, options)):
-        inside, _, z = project(probe.view, agreed)
-        # The 2nd percentile of the points inside the image, whether or not something hides them.
-        near = NEAR_SHARE * float(np.percentile(z[inside], 2)) if len(inside) else 0.0
-        beyond = probe.rgb
+        near, beyond = empty_depth(probe.view, agreed), probe.rgb
         if _any_near(probe.view, means, near):
             farther = replace(options, near=max(near, options.near))
             beyond = to_bytes(render_view(gaussians, probe.view, farther).rgb)
         yield NovelProbe(probe, near, beyond)
+
+
+def empty_depth(view: View, agreed: Doubles) -> float:
+    """The depth up to which a view sees empty space: half the distance of the nearest surface in
+    view on which two training views agree, world units; 0 if there is none.
+
+    Args:
+        agreed: (N, 3) points of that surface.
+    """
+    inside, _, z = project(view, agreed)
+    # The 2nd percentile of the points inside the image, whether or not something hides them.
+    return NEAR_SHARE * float(np.percentile(z[inside], 2)) if len(inside) else 0.0
 
 
 def _any_near(view: View, means: Floats, near: float) -> bool:

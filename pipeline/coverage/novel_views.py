@@ -19,7 +19,7 @@ from pipeline.scene.views import View, evenly_spaced
 Kind = Literal["between", "beside", "behind", "raised"]
 #: Halfway to the nearest camera; to one side; backwards; upwards, looking at the same subject.
 KINDS: tuple[Kind, ...] = get_args(Kind)
-#: Number of cameras that are moved, evenly spaced; each gives up to one novel view of each kind.
+#: Number of cameras that are moved, evenly spaced.
 MAX_CAMERAS = 6
 #: Moves, in shares of the distance from the camera to its subject.
 BESIDE, BEHIND, RAISED = 0.3, 0.35, 0.3
@@ -49,20 +49,29 @@ class NovelView:
 
 
 def choose_novel_views(training: TrainingViews, up: Doubles) -> list[NovelView]:
-    """Novel views around up to ``MAX_CAMERAS`` cameras, at free places; ordered by camera.
+    """Up to one novel view of each kind around each of up to ``MAX_CAMERAS`` cameras, at free
+    places; ordered by camera.
+
+    Args:
+        up: (3,) up vector of the world.
+    """
+    chosen: dict[tuple[str, Kind], NovelView] = {}
+    for novel in free_novel_views(training, up, MAX_CAMERAS):
+        chosen.setdefault((novel.base.name, novel.kind), novel)
+    return list(chosen.values())
+
+
+def free_novel_views(training: TrainingViews, up: Doubles, cameras: int) -> Iterator[NovelView]:
+    """All novel views at free places around up to so many cameras, ordered by camera.
 
     Args:
         up: (3,) up vector of the world.
     """
     surface = training.surface.xyz[_is_surface(training.surface)]
-    chosen: dict[tuple[int, Kind], NovelView] = {}
-    for base, novel in _candidates(training, up):
-        if (base, novel.kind) not in chosen and _is_free(novel, surface):
-            chosen[base, novel.kind] = novel
-    return list(chosen.values())
+    return (novel for novel in _candidates(training, up, cameras) if _is_free(novel, surface))
 
 
-def _candidates(training: TrainingViews, up: Doubles) -> Iterator[tuple[int, NovelView]]:
+def _candidates(training: TrainingViews, up: Doubles, cameras: int) -> Iterator[NovelView]:
     """Novel views by camera and kind, with that to be preferred first: left and right alternate."""
     distances = np.array([subject_distance(probe) for probe in training.probes])
     if not (distances > 0).any():
@@ -71,7 +80,7 @@ def _candidates(training: TrainingViews, up: Doubles) -> Iterator[tuple[int, Nov
     described = np.stack([features(view, scale) for view in training.views])
     pairs: set[frozenset[int]] = set()
     usable = [i for i, distance in enumerate(distances) if distance > 0]
-    for number, i in enumerate(evenly_spaced(usable, MAX_CAMERAS)):
+    for number, i in enumerate(evenly_spaced(usable, cameras)):
         view, distance = training.views[i], float(distances[i])
         rotation, centre = view.world_to_camera[:3, :3], view.centre
         right, ahead = heading(view, up)
@@ -86,7 +95,7 @@ def _candidates(training: TrainingViews, up: Doubles) -> Iterator[tuple[int, Nov
         moved.append(("behind", _posed(view, rotation, centre - BEHIND * distance * ahead)))
         moved.append(("raised", _raised(view, distance, up)))
         for kind, novel in moved:
-            yield number, NovelView(kind, view, novel, distance)
+            yield NovelView(kind, view, novel, distance)
 
 
 def _is_free(novel: NovelView, surface: Doubles) -> bool:

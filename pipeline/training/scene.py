@@ -229,7 +229,7 @@ def _known_depths(
 def _describe(result: TrainResult, num_views: int, run: TrainingRun, notes: Notes) -> None:
     notes.warnings += result.warnings
     if not run.is_part:
-        notes.decisions += few_views_lines(run.options, num_views)
+        notes.decisions += few_views_lines(run.options, num_views, result.early_fit)
     minutes = run.options.budget_minutes
     if not run.is_part and (
         few := too_few_epochs(result.steps, num_views, result.seconds, minutes)

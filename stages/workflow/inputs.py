@@ -121,6 +121,11 @@ def input_views(job: Job) -> list[View]:
     return _views(job, input_model(job, points=False))
 
 
+def posed_views(job: Job, refined: Reconstruction | None) -> list[View]:
+    """All views, with the cameras of a model that training refined; None: with those before."""
+    return input_views(job) if refined is None else _views(job, refined)
+
+
 def training_views(job: Job) -> list[View]:
     """The views that are not test views, with the cameras before training.
 

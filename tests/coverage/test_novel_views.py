@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.coverage.clearing import hides_free_places
 from pipeline.coverage.contradictions import NovelViews, compare_novel_views
 from pipeline.coverage.novel_views import KINDS, NovelView, choose_novel_views
 from pipeline.coverage.probe_views import project
@@ -132,16 +133,21 @@ def test_the_scene_without_defects_agrees_with_its_photographs(world: World) -> 
     assert beside[1] > 0.02, "what no photograph shows is unseen"
 
 
+def plantable(world: World) -> tuple[NovelView, float]:
+    """A novel view with room before it that no photograph shows, and its contradicted share."""
+    return next(
+        (novel, float(share))
+        for novel, (share, _) in zip(world.clean.views, world.clean.shares, strict=True)
+        if novel.kind == "beside" and len(outside(world, ahead(novel, 0.2)[None]))
+    )
+
+
 @pytest.mark.parametrize(("plant", "least"), [(veil, 0.4), (cloud, 0.4), (haze, 0.2)])
 def test_planted_defects_are_contradicted(
     world: World, plant: Callable[[World, NovelView], Gaussians], least: float
 ) -> None:
     """In a part of the view that they take up, which no rule finds but the one that is for them."""
-    novel, before = next(
-        (novel, float(share))
-        for novel, (share, _) in zip(world.clean.views, world.clean.shares, strict=True)
-        if novel.kind == "beside" and len(outside(world, ahead(novel, 0.2)[None]))
-    )
+    novel, before = plantable(world)
     found = compared(world.views, concat([world.gaussians, plant(world, novel)]))
     after = next(
         float(share)
@@ -150,6 +156,31 @@ def test_planted_defects_are_contradicted(
     )
     assert before < 0.02 and after > least
     assert found.shares[:, 0].mean() > 5 * world.clean.shares[:, 0].mean()
+
+
+@pytest.mark.parametrize("plant", [veil, cloud])
+def test_what_hides_a_free_place_is_removed(
+    world: World, plant: Callable[[World, NovelView], Gaussians]
+) -> None:
+    planted = plant(world, plantable(world)[0])
+    gaussians = concat([world.gaussians, planted])
+    hiding = hides_free_places(gaussians, world.views, Z_UP, RasterOptions(threads=2))
+    # Surfaces stay.
+    assert hiding[: len(world.gaussians)].sum() <= 1e-4 * len(world.gaussians)
+    kept = gaussians.select(torch.nonzero(~hiding)[:, 0])
+    left = compared(world.views, kept).shares[:, 0].mean()
+    assert left < 0.1 * compared(world.views, gaussians).shares[:, 0].mean() + 0.005
+    alone = hides_free_places(gaussians, world.views, Z_UP, RasterOptions(threads=1))
+    assert torch.equal(alone, hiding)
+
+
+def test_what_photographs_show_near_a_free_place_stays(world: World) -> None:
+    """A post that all photographs show, nearer to the cameras than any surface behind it."""
+    heights = np.linspace(0.2, 1.4, 40)
+    post = balls(np.stack([np.zeros(40), np.full(40, -1.2), heights], axis=1), 0.03)
+    gaussians = concat([world.gaussians, post])
+    hiding = hides_free_places(gaussians, world.views, Z_UP, RasterOptions(threads=2))
+    assert not hiding[-40:].any()
 
 
 def test_results_do_not_depend_on_threads_or_on_exposure(world: World, tmp_path: Path) -> None:

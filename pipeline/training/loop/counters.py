@@ -70,7 +70,7 @@ class TrainCounters(StageCounters):
     floaters: int = Field(
         ge=0,
         description="Number of Gaussians removed because they were close to a single camera, "
-        "or between neighbouring cameras.",
+        "between neighbouring cameras, or before places beside the cameras.",
     )
 
     def headline(self) -> str:

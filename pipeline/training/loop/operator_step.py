@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.render import Backend, Gradients
+from pipeline.render import Backend, Gradients, RasterOptions
+from pipeline.training.data.step_view import StepView
 from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
@@ -64,6 +65,17 @@ class OperatorStep(StepEngine):
         if not step.dropped_share:
             return None
         return thinned(self.state.gaussians.opacity_logits, step.dropped_share, self.state.rng)
+
+    def psnr(self, view: StepView, options: RasterOptions) -> float:
+        """PSNR in dB of a view."""
+        gaussians, appearance = self.state.gaussians, self.state.appearance
+        shown = None if appearance is None else appearance.show(gaussians, view.index)
+        rendered = self.backend.forward(*gaussians.parameters(), view.camera, options)
+        if appearance is not None and shown is not None:
+            appearance.hide(gaussians, shown)
+        found = self.color_loss.gradients(rendered, view, measures_psnr=True).psnr
+        assert found is not None
+        return found
 
     def fetch(self) -> None:
         """The tensors of the state are always current."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.scene.appearance import Appearance
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.few_views import EarlyFit
 from pipeline.training.loop.curve import TrainingCurve
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
@@ -36,6 +37,7 @@ class TrainResult:
         intrinsics: (3,) change of each camera's intrinsics by id
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
         appearance: The appearance of the Gaussians in the training views, or None.
+        early_fit: None if it was not measured.
     """
 
     gaussians: Gaussians
@@ -51,6 +53,7 @@ class TrainResult:
     poses: dict[str, NDArray[np.float64]] | None
     intrinsics: dict[int, NDArray[np.float64]] | None
     appearance: Appearance | None
+    early_fit: EarlyFit | None
 
 
 def result_of(
@@ -80,4 +83,5 @@ def result_of(
         poses=None if poses is None else dict(zip(names, poses.poses, strict=True)),
         intrinsics=None if intrinsics is None else intrinsics.by_id(),
         appearance=appearance,
+        early_fit=state.early_fit,
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from pipeline.config.settled import TrainOptions
 from pipeline.training.density.timeline import schedule_length, shrunk
-from pipeline.training.few_views import dropout_of, sh_degree_of
+from pipeline.training.few_views import dropout_of, held_back_steps, sh_degree_of
 from pipeline.training.optimisers.adam import Rates
 
 COARSE_FACTORS = (4, 2)
@@ -53,6 +53,7 @@ class Schedule:
         seen_share: The mean share of the views that see a Gaussian.
         sh_degree: The maximum degree of the spherical harmonics.
         dropout: The share of the Gaussians that is not drawn in the last step.
+        held_back_steps: The number of steps in which one view is not used.
     """
 
     options: TrainOptions
@@ -62,6 +63,7 @@ class Schedule:
     seen_share: float
     sh_degree: int
     dropout: float
+    held_back_steps: int
 
     @staticmethod
     def of(options: TrainOptions, seen_share: float = 1.0, views: int | None = None) -> Schedule:
@@ -85,6 +87,7 @@ class Schedule:
             seen_share=seen_share,
             sh_degree=options.sh_degree if views is None else sh_degree_of(options, views),
             dropout=0.0 if views is None else dropout_of(options, views),
+            held_back_steps=0 if views is None else held_back_steps(options, views),
         )
 
     def resolution_factor(self, step: int) -> int:

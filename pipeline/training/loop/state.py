@@ -16,6 +16,7 @@ from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.checkpoints.form import check_arrays, check_position
 from pipeline.training.density import Changes, Strategy, Update
+from pipeline.training.few_views import EarlyFit
 from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
 
@@ -64,6 +65,7 @@ class TrainState:
         clock: The position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, the order of the views in this epoch, of which ``position`` are done.
         appearance: The embeddings of the views; None if appearance is not modelled.
+        early_fit: None until it is measured.
         curve: The records without times; ``curve_seconds`` has the time of each.
         seconds: The training time so far, in all processes.
     """
@@ -75,6 +77,7 @@ class TrainState:
     rng: np.random.Generator
     order: NDArray[np.int64]
     appearance: AppearanceEmbeddings | None = None
+    early_fit: EarlyFit | None = None
     position: int = 0
     step: int = 0
     clock: int = 0
@@ -162,6 +165,7 @@ class TrainState:
             "rng": self.rng.bit_generator.state,
             "position": self.position,
             "clock": self.clock,
+            "early_fit": self.early_fit and asdict(self.early_fit),
             "counters": asdict(self.counters),
             "window": asdict(self.window),
             "curve": [record.model_dump() for record in self.curve],
@@ -181,6 +185,7 @@ class TrainState:
         try:
             check_position(values, len(self.order))
             rng.bit_generator.state = values["rng"]
+            early_fit = values["early_fit"] and EarlyFit(**values["early_fit"])
             counters = dict(values["counters"])
             restored = Counters(changes=Changes(**counters.pop("changes")), **counters)
             window = CurveWindow(**values["window"])
@@ -202,6 +207,7 @@ class TrainState:
             self.appearance.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]
+        self.early_fit = early_fit
         self.counters, self.window, self.curve = restored, window, curve
         self.curve_seconds, self.seconds = curve_seconds, seconds
 

@@ -10,10 +10,11 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import freed_memory
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.step_view import StepView
-from pipeline.training.data.targets import usable_factor
+from pipeline.training.data.targets import psnr_of, usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.density.strategy import DensityStep
+from pipeline.training.few_views import EarlyFit, central_view
 from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.operator_step import OperatorStep
@@ -38,6 +39,8 @@ class Trainer:
         self.scene, self.state, self.run, self.backend = scene, state, run, backend
         views = None if run.is_part else len(scene.views)
         self.schedule = Schedule.of(run.options, scene.inputs.seen_share, views)
+        held_back = self.schedule.held_back_steps > 0
+        self.held_back = central_view(scene.views) if held_back else None
         self.engine = make_engine(scene, state, run, backend, self.schedule)
         self.floaters = floater_removal(scene, run)
         self.rate_unit = learning_rate_unit(scene.inputs, run.options)
@@ -51,6 +54,8 @@ class Trainer:
         # The steps of the schedule that this optimiser step covers: one, without a time budget.
         steps = self.clock.advance(state)
         self.raise_sh_degree()
+        if self.held_back is not None and not self.holds_back() and state.early_fit is None:
+            state.early_fit = self.measure_fit(self.held_back)
         self.clock.observe(state, self.factor())
         run_length = self.clock.run_length(state)
         view = self.next_view()
@@ -66,7 +71,7 @@ class Trainer:
                     state.clock, max(1.0, run_length * share)
                 ),
                 measures_psnr=(state.step - 1) % self.psnr_interval == 0,
-                dropped_share=self.schedule.dropped_share_at(state.clock),
+                dropped_share=self.dropped_share(),
             )
         )
         self.count(result)
@@ -86,16 +91,43 @@ class Trainer:
             state.counters.floaters += before - len(state.gaussians)
 
     def next_view(self) -> StepView:
-        """The view of this step: each view once in each shuffled epoch."""
-        index, factor = self.state.next_view(), self.factor()
+        """The view of this step: each view once in each shuffled epoch, but for that held back."""
+        index = self.state.next_view()
+        while index == self.held_back and self.holds_back():
+            index = self.state.next_view()
+        return self.step_view(index, self.draw_background())
+
+    def step_view(self, index: int, background: Color) -> StepView:
+        factor = self.factor()
         return StepView(
             index,
             factor,
             self.scene.views[index],
             self.scene.target(index, factor),
             self.camera(index, factor),
-            self.draw_background(),
+            background,
         )
+
+    def holds_back(self) -> bool:
+        """Whether a view is held back in this step."""
+        return self.state.clock <= self.schedule.held_back_steps
+
+    def dropped_share(self) -> float:
+        """The share of the Gaussians that is not drawn in this step."""
+        fit = self.state.early_fit
+        if self.held_back is not None and (fit is None or fit.is_exact):
+            return 0.0
+        return self.schedule.dropped_share_at(self.state.clock)
+
+    def measure_fit(self, held_back: int) -> EarlyFit:
+        """Compare the view held back with the other training views."""
+        assert isinstance(self.engine, OperatorStep)
+        background = BACKGROUNDS["black"]
+        options, found = self.raster_options(background), []
+        for index in range(len(self.scene.views)):
+            found.append(self.engine.psnr(self.step_view(index, background), options))
+        psnr = found.pop(held_back)
+        return EarlyFit(psnr, psnr_of(float(np.mean([10 ** (-p / 10) for p in found]))))
 
     def control_density(self, steps: range, run_length: float) -> None:
         """Add noise, densify, prune and reset opacities after these steps of the schedule."""

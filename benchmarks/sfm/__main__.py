@@ -52,12 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         count = len(scene.manifest.photos)
         print(f"{scene.name}: {count} photographs, measured against {scene.truth_kind}")
     print(f"{args.threads} threads, {args.repeats} runs of each")
+    facts = measured("sfm", args.note, arguments) if args.json else None
     for _ in range(args.repeats):
         for scene in scenes:
             chosen = [*([None] if REFERENCE in args.configs else [])]
             for configuration in [*chosen, *configurations(scene, args.configs)]:
                 run = run_once(scene, configuration, args.threads)
                 runs.append(run)
+                if facts is not None:  # A run takes minutes: finished ones are kept.
+                    write_record(args.json, facts, runs)
                 told = run.failure or f"{run.cpu_s:.1f} CPU s, {run.registered} images"
                 print(f"{scene.name} {run.configuration}: {told}", file=sys.stderr, flush=True)
     if not runs:
@@ -66,8 +69,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             fix='for example --configs pycolmap plan "balanced/*"',
         )
     print(table(summaries(runs)), end="")
-    if args.json:
-        write_record(args.json, measured("sfm", args.note, arguments), runs)
     return 0
 
 

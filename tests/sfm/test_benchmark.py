@@ -102,3 +102,19 @@ def test_a_run_measures_the_pipeline_and_pycolmap(demo, tmp_path, capsys):
     assert "| demo | **fast/incremental/exhaustive** |" in record_tables.table_of("sfm", [record])
     assert record_tables.table_of("sfm", [record]) in capsys.readouterr().out
     assert record["command"] == f"python -m benchmarks.sfm {' '.join(arguments)} --json FILE"
+
+
+def test_finished_runs_are_kept_when_one_dies(demo, tmp_path, monkeypatch):
+    runs = [run(10, 0.5, "pycolmap")]
+
+    def dying(*_):
+        if not runs:
+            raise KeyboardInterrupt
+        return runs.pop()
+
+    monkeypatch.setattr("benchmarks.sfm.__main__.run_once", dying)
+    file = tmp_path / "a.json"
+    with pytest.raises(KeyboardInterrupt):
+        main([str(demo), "--configs", "pycolmap", "--repeats", "2", "--json", str(file)])
+    (kept,) = Record[Run].model_validate(json.loads(file.read_text())).results
+    assert kept.configuration == "pycolmap"

@@ -80,6 +80,11 @@ def measure_consistency(
     )
 
 
+def pair_agrees(a: ModelView, b: ModelView, matches: NDArray[np.uint32]) -> bool:
+    """Whether at least half of the (M, 2) verified matches of two images agree with their poses."""
+    return bool(_matches_agree(a, b, matches).mean() >= MIN_AGREEING_SHARE)
+
+
 def _matches_agree(a: ModelView, b: ModelView, matches: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """(M,) True for matches that satisfy the essential matrix of the pair's relative pose (by the
     Sampson distance) and triangulate in front of both cameras."""

@@ -37,7 +37,7 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         total: The number of photographs of the scene.
     """
     with pycolmap.Database.open(database) as opened:
-        verified = _verified_pairs(opened)
+        verified = read_verified_pairs(opened)
         views = read_views(model, opened)
     pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
     behind, observations, angles = _geometry(model, views)
@@ -106,7 +106,7 @@ def _geometry(
     return behind / max(observations, 1), observations, angles
 
 
-def _verified_pairs(database: pycolmap.Database) -> Pairs:
+def read_verified_pairs(database: pycolmap.Database) -> Pairs:
     """Image ids -> (M, 2) verified matches, for the pairs that have any, sorted by ids."""
     found = {}
     ids, geometries = database.read_two_view_geometries()

@@ -19,6 +19,9 @@ MIN_MODEL_SIZE = 3
 # as constrain the poses: faster, and as accurate after the final bundle adjustment.
 MAX_PHOTOS_WITH_ALL_POINTS = 200
 
+# Smallest number of matches by which a photograph is registered in a finished model (COLMAP: 30).
+MIN_INLIERS_LATER = 15
+
 # Global mapping uses the longest tracks only: several times faster at the same accuracy.
 GLOBAL_TRACKS_PER_VIEW = 300
 
@@ -88,6 +91,35 @@ def _map_incremental(
         database, out, out, options, next_image_callback=registered
     )
     return [models[key] for key in sorted(models)]
+
+
+def continue_mapping(
+    model: pycolmap.Reconstruction, database: Path, folder: Path, seed: int
+) -> pycolmap.Reconstruction:
+    """Register more photographs in a model, by fewer matches than mapping asks for. Its poses and
+    cameras stay as they are. Runs on one thread.
+
+    Args:
+        database: The database that the model was mapped from; not changed.
+        folder: An empty folder for files.
+    """
+    given = folder / "given"
+    given.mkdir()
+    model.write_binary(given)
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=1,
+        random_seed=seed,
+        multiple_models=False,
+        extract_colors=False,
+        fix_existing_frames=True,
+        constant_cameras=set(model.cameras),
+    )
+    options.mapper.abs_pose_min_num_inliers = MIN_INLIERS_LATER
+    options.triangulation.ignore_two_view_tracks = False
+    found = pycolmap.incremental_mapping(
+        _with_fisheye_priors(database, folder), folder, folder, options, input_path=given
+    )
+    return max(found.values(), key=lambda m: m.num_reg_images(), default=model)
 
 
 def _map_global(database: Path, out: Path, total: int, seed: int) -> list[pycolmap.Reconstruction]:

@@ -25,6 +25,7 @@ from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
 from pipeline.sfm.judge import Verdict
+from pipeline.sfm.left_out import register_left_out
 from pipeline.sfm.matching import list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
 from pipeline.sfm.refine import refine
@@ -99,6 +100,10 @@ def reconstruct(
             evidence = collect_evidence(model, attempt.database, total)
         else:
             decisions.append("cameras not refined further: the model is weak and would overfit")
+        model, late = register_left_out(model, attempt.database, seed)
+        if late:
+            evidence = collect_evidence(model, attempt.database, total)
+            decisions.append(f"registered in a second try, with fewer matches: {list_names(late)}")
         cameras = _camera_summaries(model, focal_priors(attempt.database))
     frame = align_model(model, manifest, config.georeference, ground_control)
     models = [model, *attempt.models[1:]]

@@ -197,7 +197,7 @@ class TrainExperiments(Section):
         description="Share of the Gaussians that is not drawn in a step, at the end of the run; it "
         "rises from 0. null: 0.2 for up to 26 training views and at least 50 epochs, else 0 "
         "(3DGS: 0); of six views and more, one is held back in the first quarter of the run, and "
-        "the share is 0 if it and the others then have 34 dB.",
+        "the share is 0 if it and the others then have a PSNR of 34.",
     )
     views_per_sh_coefficient: Annotated[float, Field(ge=0, le=MAX_FACTOR), Unit("views")] = Field(
         1.0,

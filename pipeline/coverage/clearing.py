@@ -1,4 +1,4 @@
-"""What hides the scene from beside the photographs is removed.
+"""Finds the Gaussians that hide the scene from places beside the cameras.
 
 No photograph contradicts a Gaussian that stands beside or behind the cameras, or that one of them
 alone shows. From a place where one may walk, it can hide everything.
@@ -31,9 +31,9 @@ MAX_CAMERAS = 60
 #: at less than three times the distance, if it is there.
 MIN_RATIO = 8.0
 #: A training view shows a Gaussian if it sees this share of what it would see without any other.
-#: What so many training views show is not removed.
+#: A Gaussian that so many training views show is not removed.
 MIN_VISIBLE, SHOWN_BY = 0.25, 4
-#: What covers less of a novel view, as a share of the image, hides nothing.
+#: A Gaussian that covers a smaller share of a novel view hides nothing.
 MIN_SHARE = 1e-5
 
 

@@ -17,7 +17,7 @@ from pipeline.sfm.evidence import read_verified_pairs
 from pipeline.sfm.mappers import continue_mapping
 from pipeline.sfm.model_views import ModelView, Pairs, read_views
 
-#: Smallest number of pairs with registered photographs, and of them of pairs that agree.
+#: Smallest number of pairs with registered photographs that agree with the pose.
 MIN_PAIRS = 2
 #: Smallest share of the pairs with registered photographs that agree with the pose.
 MIN_AGREEING_PAIRS = 0.75

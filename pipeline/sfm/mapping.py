@@ -24,7 +24,7 @@ from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
-from pipeline.sfm.judge import Verdict
+from pipeline.sfm.judge import Verdict, judge
 from pipeline.sfm.left_out import register_left_out
 from pipeline.sfm.matching import list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
@@ -100,9 +100,12 @@ def reconstruct(
             evidence = collect_evidence(model, attempt.database, total)
         else:
             decisions.append("cameras not refined further: the model is weak and would overfit")
-        model, late = register_left_out(model, attempt.database, seed)
-        if late:
-            evidence = collect_evidence(model, attempt.database, total)
+        verdict = attempt.verdict
+        more, late = register_left_out(model, attempt.database, seed)
+        found = collect_evidence(more, attempt.database, total) if late else evidence
+        judged = judge(found, config.min_registered_share)
+        if late and judged.grade != "failed":
+            model, evidence, verdict = more, found, judged
             decisions.append(f"registered in a second try, with fewer matches: {list_names(late)}")
         cameras = _camera_summaries(model, focal_priors(attempt.database))
     frame = align_model(model, manifest, config.georeference, ground_control)
@@ -124,12 +127,12 @@ def reconstruct(
         mean_track_length=float(model.compute_mean_track_length()),
         other_models=sizes,
         cameras=cameras,
-        verdict=attempt.verdict.grade,
+        verdict=verdict.grade,
         evidence=evidence,
         attempts=attempts,
         georeference=georeference.summary(),
     )
-    warnings += [*frame.warnings, *_warnings(counters, attempt.verdict)]
+    warnings += [*frame.warnings, *_warnings(counters, verdict)]
     return MappedScene(
         Report(counters, decisions + frame.decisions, warnings), models, georeference
     )

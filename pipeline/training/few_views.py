@@ -28,7 +28,7 @@ from pipeline.training.density.timeline import schedule_length
 FEW_VIEWS, SHARE = 26, 0.2
 # Runs of fewer epochs do not overfit.
 MIN_EPOCHS = 50
-# Of fewer views none is held back: they do not determine a scene.
+# With fewer views none is held back, since so few do not determine a scene.
 MIN_VIEWS_TO_HOLD_BACK = 6
 # A view is held back in this share of the run.
 HELD_BACK_SHARE = 0.25

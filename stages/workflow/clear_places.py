@@ -1,5 +1,5 @@
-"""Free places beside the cameras, in a trained scene. Not in ``training``, which the jobs of blocks
-import as well."""
+"""Keeps places beside the cameras free in a trained scene. It is separate from ``training``, which
+the jobs of blocks import as well, so that their keys do not change with coverage."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class TrainResult:
         intrinsics: (3,) change of each camera's intrinsics by id
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
         appearance: The appearance of the Gaussians in the training views, or None.
-        early_fit: None if it was not measured.
+        early_fit: The fit while one view was held back; None if none was.
     """
 
     gaussians: Gaussians

@@ -65,7 +65,7 @@ class TrainState:
         clock: The position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, the order of the views in this epoch, of which ``position`` are done.
         appearance: The embeddings of the views; None if appearance is not modelled.
-        early_fit: None until it is measured.
+        early_fit: The fit while one view was held back; None until it is measured.
         curve: The records without times; ``curve_seconds`` has the time of each.
         seconds: The training time so far, in all processes.
     """
@@ -185,7 +185,8 @@ class TrainState:
         try:
             check_position(values, len(self.order))
             rng.bit_generator.state = values["rng"]
-            early_fit = values["early_fit"] and EarlyFit(**values["early_fit"])
+            fit = values["early_fit"]
+            early_fit = fit and EarlyFit(float(fit["held_back"]), float(fit["others"]))
             counters = dict(values["counters"])
             restored = Counters(changes=Changes(**counters.pop("changes")), **counters)
             window = CurveWindow(**values["window"])

@@ -98,6 +98,7 @@ class Trainer:
         return self.step_view(index, self.draw_background())
 
     def step_view(self, index: int, background: Color) -> StepView:
+        """A training view at the size of this step."""
         factor = self.factor()
         return StepView(
             index,

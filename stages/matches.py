@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.settled import Matches
+from pipeline.config.settled import Features, Matches
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -25,8 +25,10 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.sfm.matching import match_features
     from pipeline.sfm.pair_list import PairList
+    from pipeline.sfm.second_look import SecondLook
 
     scene, parts = matching_scene(job), inputs.of_jobs(job, "match")
+    look = SecondLook(job.section(Features), job.cache_of("features"), job.scratch / "features")
     report = match_features(
         scene,
         job.section(Matches),
@@ -35,8 +37,8 @@ def work(job: Job) -> None:
         threads=job.threads,
         chosen=PairList.read(job.inputs["pairs"]) if parts else None,
         parts=[part / CHUNK_FILE for part in parts],
+        look=look,
     )
-    scene.write_colors(job.out / "keypoint_colors.npz")
     job.record(report.counters, report.decisions, report.warnings)
     if not parts:
         # Not a counter: it depends on earlier runs.
@@ -55,7 +57,7 @@ SPEC = StageSpec(
         "match": ("match",),
     },
     optional=("pairs", "match"),
-    options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
-    packages=("pycolmap",),
+    options=("features", "matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
+    packages=("pycolmap", "opencv-contrib-python-headless"),
     seeded=True,
 )

@@ -19,6 +19,7 @@ from pipeline.runtime.record import read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.mappers import Mapper
+from pipeline.sfm.second_look import SecondLook
 
 Look = Literal["as_it_is", "bare", "blurred"]
 PICTURES: dict[str, Look] = {
@@ -88,7 +89,8 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
     manifest = found.manifest
     features = work / "features"
     extract_features(manifest, settled.features, features, cache=work / "cache", threads=1)
-    run_isolated(_match, manifest, features, settled.matches, settled.sfm, work, seed)
+    look = SecondLook(settled.features, work / "cache", work / "more_features")
+    run_isolated(_match, manifest, features, settled.matches, settled.sfm, work, seed, look)
     mapper = settled.sfm.mapper
     assert mapper != "auto"
     return Matched(
@@ -115,11 +117,18 @@ def _finished(folder: Path, work: Path) -> Matched:
 
 
 def _match(
-    manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, work: Path, seed: int
+    manifest: Manifest,
+    features: Path,
+    matches: Matches,
+    sfm: Sfm,
+    work: Path,
+    seed: int,
+    look: SecondLook,
 ) -> None:
     from pipeline.sfm.matching import MatchingScene, match_features
 
     # This stage raises an error if no pair is verified. Mapping then finds no model.
     with contextlib.suppress(UserError):
         scene = MatchingScene(manifest, features, sfm, seed)
-        match_features(scene, matches, work / "database.db")
+        database, cache = work / "database.db", work / "cache"
+        match_features(scene, matches, database, cache=cache, look=look)

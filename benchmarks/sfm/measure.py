@@ -85,11 +85,14 @@ def our_features(manifest: Manifest, config: Config, folder: Path, threads: int)
 def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
     """Do what stages/matches.py does."""
     from pipeline.sfm.matching import MatchingScene, match_features
+    from pipeline.sfm.second_look import SecondLook
 
     scene = MatchingScene(manifest, folder / "features", config.sfm, config.seed)
     out, cache = folder / "matches", folder / "cache"
-    match_features(scene, config.matches, out / "database.db", cache=cache, threads=threads)
-    scene.write_colors(out / "keypoint_colors.npz")
+    look = SecondLook(config.features, cache, out / "features")
+    match_features(
+        scene, config.matches, out / "database.db", cache=cache, threads=threads, look=look
+    )
 
 
 def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:

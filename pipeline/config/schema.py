@@ -126,6 +126,11 @@ class Video(Section):
     )
 
 
+#: Number of features of each photograph where those of ``Features.max_features`` connect many
+#: photographs weakly, and the largest scene that gets them.
+MORE_FEATURES, MAX_PHOTOS_WITH_MORE_FEATURES = 8192, 500
+
+
 class Features(Section):
     """SIFT features."""
 
@@ -133,7 +138,9 @@ class Features(Section):
         "opencv", description="opencv: OpenCV's SIFT (faster); colmap: COLMAP's extractor."
     )
     max_features: Annotated[int, Field(gt=0, le=1_000_000), Unit("per image")] = Field(
-        4096, description="Maximum number of features; the strongest are kept."
+        4096,
+        description="Maximum number of features; the strongest are kept. Where these connect many "
+        f"photographs weakly, up to {MORE_FEATURES} are extracted and matched instead.",
     )
     max_long_side_px: Pixels = Field(
         1600, description="Larger photographs are reduced to this length before extraction."

@@ -9,7 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from pipeline.config.schema import RENDERED_FORMATS
+from pipeline.config.schema import (
+    MAX_PHOTOS_WITH_MORE_FEATURES,
+    MORE_FEATURES,
+    RENDERED_FORMATS,
+)
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
@@ -136,8 +140,16 @@ def _features(plan: Plan, threads: int) -> float:
 
 
 def _mapping(plan: Plan, threads: int) -> float:
-    share = plan.config.features.max_features / _FEATURES
-    return _PROGRAM + 25 + _MAPPING * share * _photos(plan)
+    return _PROGRAM + 25 + _MAPPING * _feature_share(plan) * _photos(plan)
+
+
+def _feature_share(plan: Plan) -> float:
+    """The number of features of a photograph, relative to that of the estimates. A second look
+    raises the number."""
+    most = plan.config.features.max_features
+    if _photos(plan) <= MAX_PHOTOS_WITH_MORE_FEATURES:
+        most = max(most, MORE_FEATURES)
+    return most / _FEATURES
 
 
 def _gathered_features(plan: Plan, threads: int) -> float:
@@ -149,7 +161,11 @@ def _pairs(plan: Plan, threads: int) -> float:
 
 
 def _matches(plan: Plan, threads: int) -> float:
-    return _match(plan, threads) if plan.is_one_job else _gathered_matches(plan)
+    if not plan.is_one_job:
+        return _gathered_matches(plan)
+    # A second look extracts more features in a process beside this one, and then matches them.
+    looked = _gathered_matches(plan) + _features(plan, threads)
+    return max(looked, _matching(plan, _feature_share(plan)))
 
 
 def _gathered_matches(plan: Plan) -> float:
@@ -157,10 +173,13 @@ def _gathered_matches(plan: Plan) -> float:
 
 
 def _match(plan: Plan, threads: int) -> float:
+    return _matching(plan, plan.config.features.max_features / _FEATURES)
+
+
+def _matching(plan: Plan, feature_share: float) -> float:
     """The memory of matching, which holds the features of a limited number of photographs."""
-    share = plan.config.features.max_features / _FEATURES
     in_memory = min(plan.photos_per_job, _KEYPOINT_FILES)
-    return _gathered_matches(plan) + _MATCHES * share * in_memory
+    return _gathered_matches(plan) + _MATCHES * feature_share * in_memory
 
 
 def _undistort(plan: Plan, threads: int) -> float:

@@ -26,6 +26,12 @@ from pipeline.sfm.keypoints import Keypoints, keypoint_file
 # Part of the cache key: increase it when a change of the code changes keypoints.
 ALGORITHM_VERSION = 3
 
+# Of OpenCV, which divides it by its 3 octave layers; COLMAP's peak threshold is that quotient. Half
+# of OpenCV's default: weakly textured scenes need weak keypoints, and the number is limited anyway.
+# At the low one OpenCV finds as many keypoints as COLMAP does at the other.
+CONTRAST_THRESHOLD, LOW_CONTRAST_THRESHOLD = 0.02, 0.01
+OCTAVE_LAYERS = 3
+
 # Peak memory per pixel of a photograph while it is decoded, and of the image that SIFT is detected
 # in: its scale space begins with twice the size.
 _PHOTO_BYTES, _SIFT_BYTES = 7.0, 250.0
@@ -82,20 +88,26 @@ def gather_features(
 
 
 def extract_photos(
-    photos: Sequence[Photo], config: settled.Features, out: Path, *, cache: Path, threads: int
+    photos: Sequence[Photo],
+    config: settled.Features,
+    out: Path,
+    *,
+    cache: Path,
+    threads: int,
+    contrast_threshold: float = CONTRAST_THRESHOLD,
 ) -> Report[FeaturesCounters]:
     """``extract_features`` of some photographs, which removes no files from the cache. Several
     processes may do so at the same time with the same cache."""
     out.mkdir(parents=True, exist_ok=True)
     cache.mkdir(parents=True, exist_ok=True)
-    keys = {photo.name: _cache_key(photo, config) for photo in photos}
+    keys = {photo.name: _cache_key(photo, config, contrast_threshold) for photo in photos}
     absent = [p for p in photos if not (cache / f"{keys[p.name]}.npz").exists()]
     # Use one photograph of each key: identical photographs would write the same file concurrently.
     missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv
         targets = {p.name: cache / f"{keys[p.name]}.npz" for p in missing}
-        extract(missing, config, targets, threads)
+        extract(missing, config, contrast_threshold, targets, threads)
     counts = {}
     for photo in photos:
         source = cache / f"{keys[photo.name]}.npz"
@@ -125,13 +137,16 @@ def _report(
     )
 
 
-def _cache_key(photo: Photo, config: settled.Features) -> str:
+def _cache_key(
+    photo: Photo, config: settled.Features, contrast_threshold: float = CONTRAST_THRESHOLD
+) -> str:
     """Hash of everything that determines the keypoints. Extraction compares the files that it
     decodes with the digests in the key."""
     facts = {
         "photo": photo.digest,
         "mask": photo.mask_digest,
         "config": config.model_dump(mode="json", exclude={"photos_per_job"}),
+        "contrast_threshold": contrast_threshold,
         "version": ALGORITHM_VERSION,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -148,6 +163,7 @@ def _prune(cache: Path, manifest: Manifest, config: settled.Features) -> None:
 def _extract_opencv(
     photos: list[Photo],
     config: settled.Features,
+    contrast_threshold: float,
     targets: dict[str, Path],
     threads: int,
 ) -> None:
@@ -162,7 +178,8 @@ def _extract_opencv(
 
     def extract(photo: Photo) -> None:
         picture = sift.DetectionImage(photo, config.max_long_side_px)
-        sift.detect(picture, config.max_features).write(targets[photo.name])
+        found = sift.detect(picture, config.max_features, contrast_threshold)
+        found.write(targets[photo.name])
 
     for_each(extract, photos, threads, *PROGRESS)
 
@@ -170,6 +187,7 @@ def _extract_opencv(
 def _extract_colmap(
     photos: list[Photo],
     config: settled.Features,
+    contrast_threshold: float,
     targets: dict[str, Path],
     threads: int,
 ) -> None:
@@ -187,7 +205,10 @@ def _extract_colmap(
                 picture = sift.DetectionImage(photo, config.max_long_side_px)
                 sift.write_grey(picture, str(Path(folder) / f"{index:06d}.png"))
                 pictures[photo.name] = picture
-            found = run_isolated(_colmap_sift, Path(folder), config.max_features, threads)
+            peak_threshold = contrast_threshold / OCTAVE_LAYERS
+            found = run_isolated(
+                _colmap_sift, Path(folder), config.max_features, peak_threshold, threads
+            )
             for index, photo in enumerate(some):
                 keypoints, descriptors = found[f"{index:06d}.png"]
                 picture = pictures[photo.name]
@@ -207,7 +228,7 @@ def _extract_colmap(
 
 
 def _colmap_sift(
-    folder: Path, max_features: int, threads: int
+    folder: Path, max_features: int, peak_threshold: float, threads: int
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """File name -> (F, 4) keypoints (x, y, scale, orientation) and (F, 128) descriptors."""
     import pycolmap
@@ -218,6 +239,7 @@ def _colmap_sift(
     path = folder / "features.db"
     options = pycolmap.FeatureExtractionOptions(num_threads=threads)
     options.sift.max_num_features = max_features
+    options.sift.peak_threshold = peak_threshold
     pycolmap.extract_features(path, folder, extraction_options=options, device=pycolmap.Device.cpu)
     with pycolmap.Database.open(path) as database:
         found = {}

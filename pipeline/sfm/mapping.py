@@ -26,7 +26,7 @@ from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
 from pipeline.sfm.judge import Verdict, judge
 from pipeline.sfm.left_out import register_left_out
-from pipeline.sfm.matching import list_names
+from pipeline.sfm.matching import COLORS_FILE, list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
 from pipeline.sfm.refine import refine
 
@@ -66,7 +66,7 @@ def reconstruct(
     """Map a scene, check the model, refine its cameras and georeference it. Runs on one thread.
 
     Args:
-        database: The database that ``match_features`` wrote; not changed. ``keypoint_colors.npz``
+        database: The database that ``match_features`` wrote; not changed. ``COLORS_FILE``
             beside it gives the points' colours.
         config: The settled options.
         ground_control: The scene's ``gcp_list.txt``; None without one.
@@ -110,7 +110,7 @@ def reconstruct(
         cameras = _camera_summaries(model, focal_priors(attempt.database))
     frame = align_model(model, manifest, config.georeference, ground_control)
     models = [model, *attempt.models[1:]]
-    if colors := _read_colors(database.with_name("keypoint_colors.npz")):
+    if colors := _read_colors(database.with_name(COLORS_FILE)):
         for each in models:
             color_points(each, colors)
     registered = {model.image(i).name for i in model.reg_image_ids()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.config import settled
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
+from pipeline.config.schema import MORE_FEATURES
 from pipeline.runtime.counters import Report
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
@@ -33,7 +34,15 @@ from pipeline.sfm.fisheye import set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.models import is_uncalibrated, quiet_colmap, set_focal
 from pipeline.sfm.pair_list import PairList
+from pipeline.sfm.second_look import (
+    MIN_STRONG_PAIRS,
+    STRONG_INLIERS,
+    SecondLook,
+    extract_more,
+)
 
+#: The colours of the keypoints, beside the database: image id -> (F, 3) uint8.
+COLORS_FILE = "keypoint_colors.npz"
 NAMES_SHOWN = 5
 
 
@@ -75,15 +84,6 @@ class MatchingScene:
             self.seed,
         )
 
-    def write_colors(self, path: Path) -> None:
-        """Write image id -> (F, 3) uint8 colours of its keypoints, as by ``np.savez``, with the
-        colours of one image in memory at a time."""
-        with zipfile.ZipFile(path, "w") as archive:
-            for image_id, colors in self.inputs().colors():
-                # A member written by its name gets a fixed date.
-                with archive.open(f"{image_id}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, colors)
-
 
 def match_features(
     scene: MatchingScene,
@@ -94,12 +94,14 @@ def match_features(
     threads: int = 1,
     chosen: PairList | None = None,
     parts: Sequence[Path] = (),
+    look: SecondLook | None = None,
 ) -> Report[MatchesCounters]:
     """Choose pairs, match them and verify their two-view geometry.
 
     Writes a COLMAP database: cameras with their priors, images with ids from 1 in order of names,
-    keypoints, matches, two-view geometries. It depends neither on ``threads`` nor on the cache, nor
-    on the number of jobs.
+    keypoints, matches, two-view geometries; and beside it the keypoints' colours
+    (``COLORS_FILE``). They depend neither on ``threads`` nor on the cache, nor on the number of
+    jobs.
 
     Args:
         config: The settled options.
@@ -107,6 +109,7 @@ def match_features(
         cache: A folder for results of pairs that outlives the call.
         chosen: The result of ``choose_pairs``; None: the pairs are chosen.
         parts: The databases of the jobs that have matched them by ``match_chunk``, in order.
+        look: The second look with more features; None: there is none.
 
     Raises:
         UserError: No pair of photographs could be verified.
@@ -120,6 +123,19 @@ def match_features(
     )
     names, cameras = [name for _, name, _ in inputs.images], inputs.cameras
     verified = verified_inliers(database)
+    decisions = list(chosen.decisions)
+    if look is not None and look.is_needed(names, verified):
+        before = len(verified)
+        extract_more(scene.manifest, look, threads)
+        scene = replace(scene, features=look.out)
+        build_database(database, scene.inputs(chosen.focals), pairs, cache=cache, threads=threads)
+        verified = verified_inliers(database)
+        decisions.append(
+            f"many photographs had fewer than {MIN_STRONG_PAIRS} pairs with {STRONG_INLIERS} "
+            f"inliers: up to {MORE_FEATURES} features in each raise the verified pairs from "
+            f"{before} to {len(verified)}"
+        )
+    _write_colors(scene.inputs(), database.with_name(COLORS_FILE))
     if not verified:
         raise UserError(
             f"no two of the {len(names)} photographs overlap: {len(pairs)} pairs were matched, and "
@@ -144,8 +160,7 @@ def match_features(
         isolated=isolated,
         num_cameras=len(cameras),
     )
-    decisions = [
-        *chosen.decisions,
+    decisions += [
         f"{len(verified)} of {len(pairs)} pairs verified, with a median of "
         f"{counters.median_inliers} inliers",
         f"{len(cameras)} camera(s) ({models}) for {len(names)} photographs, {priors} with a focal "
@@ -229,6 +244,16 @@ def resolve_pairs(
     else:
         raise ValueError(f"the kind of pairs must be chosen, found: {config.pairs}")
     return pairs, f"{config.pairs} pairs: {len(pairs)} of {count * (count - 1) // 2} possible"
+
+
+def _write_colors(inputs: MatchingInputs, path: Path) -> None:
+    """Write image id -> (F, 3) uint8 colours of its keypoints, as by ``np.savez``, with the colours
+    of one image in memory at a time."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for image_id, colors in inputs.colors():
+            # A member written by its name gets a fixed date.
+            with archive.open(f"{image_id}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, colors)
 
 
 def list_names(names: list[str]) -> str:

@@ -11,10 +11,6 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.sfm.keypoints import Keypoints, root_sift
 
-# COLMAP's peak threshold is 0.02 / 3; OpenCV divides this value by its 3 octave layers. Half of
-# OpenCV's default: weakly textured scenes need weak keypoints, and the number is limited anyway.
-CONTRAST_THRESHOLD = 0.02
-
 
 class DetectionImage:
     """A photograph prepared for feature detection: downscaled, grey, with its mask.
@@ -73,13 +69,13 @@ class DetectionImage:
         )
 
 
-def detect(picture: DetectionImage, max_features: int) -> Keypoints:
+def detect(picture: DetectionImage, max_features: int, contrast_threshold: float) -> Keypoints:
     """SIFT keypoints with RootSIFT descriptors (``keypoints.root_sift``): the ``max_features`` of
-    strongest response among the usable pixels."""
+    strongest response among the usable pixels. ``contrast_threshold`` is OpenCV's."""
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]
         # OpenCV selects the strongest before it applies the mask: with a mask, select below.
         nfeatures=max_features if picture.usable is None else 0,
-        contrastThreshold=CONTRAST_THRESHOLD,
+        contrastThreshold=contrast_threshold,
         # Otherwise keypoints are biased by a quarter of a pixel.
         enable_precise_upscale=True,
     )

@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.config import settled
 from pipeline.config.experiments import MatchesExperiments
 from pipeline.scene.manifest import Manifest
+from pipeline.sfm.second_look import SecondLook
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -34,15 +35,19 @@ def match(
     sfm: settled.Sfm | None = None,
     threads: int = 2,
     min_inliers: int = 15,
+    look: SecondLook | None = None,
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import MatchingScene, match_features
 
     experiments = MatchesExperiments(min_inliers=min_inliers)
     scene = MatchingScene(manifest, features, sfm or settled.Sfm(), 0, experiments)
     config = settled.Matches.model_validate({"pairs": pairs})
-    cache = out.with_name("cache")
-    report = match_features(scene, config, out / "database.db", cache=cache, threads=threads)
-    scene.write_colors(out / "keypoint_colors.npz")
+    report = match_features(
+        *(scene, config, out / "database.db"),
+        cache=out.with_name("cache"),
+        threads=threads,
+        look=look,
+    )
     return flat(report)
 
 
@@ -64,7 +69,6 @@ def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> 
         pairs, cached = pairs + report.counters.num_pairs, cached + report.num_cached
     database = out / "database.db"
     whole = match_features(scene, config, database, cache=cache, chosen=chosen, parts=parts)
-    scene.write_colors(out / "keypoint_colors.npz")
     assert whole.num_cached == pairs == whole.counters.num_pairs, "nothing is left to match"
     return flat(whole) | {"num_cached": cached}
 

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
 from pipeline.sfm import nearest as near
 from pipeline.sfm.features import extract_features
+from pipeline.sfm.second_look import SecondLook
 from stages.workflow.registry import STAGES
 from tests.plans import make_plan
 from tests.sfm import corner, jobs
@@ -218,6 +220,44 @@ def test_a_corrupt_cache_is_replaced(room, tmp_path):
     before = jobs.digests(tmp_path / "matches")
     report = run_isolated(jobs.match, manifest, folder / "features", tmp_path / "matches")
     assert report["num_cached"] == 0 and jobs.digests(tmp_path / "matches") == before
+
+
+def test_weakly_connected_photographs_get_more_features(room, tmp_path):
+    """Fifty features verify few pairs. The second look finds what as many features find at once,
+    with the same bytes for any number of threads; it is not made where it is not needed."""
+    folder, photos = room
+    manifest = corner.manifest(photos)
+    few = settled.Features(max_features=50)
+    extract_features(manifest, few, tmp_path / "few", cache=tmp_path / "c", threads=2)
+    look = SecondLook(few, tmp_path / "c", tmp_path / "more")
+    before = run_isolated(jobs.match, manifest, tmp_path / "few", tmp_path / "a" / "matches")
+    after = run_isolated(
+        jobs.match, manifest, tmp_path / "few", tmp_path / "b" / "matches", threads=1, look=look
+    )
+    assert after["num_verified"] > before["num_verified"]
+    assert "8192 features" in after["decisions"][1]
+    direct = run_isolated(jobs.match, manifest, tmp_path / "more", tmp_path / "d" / "matches")
+    assert direct["num_verified"] == after["num_verified"]
+    written = [jobs.digests(tmp_path / name / "matches") for name in "bd"]
+    assert written[0] == written[1]
+    enough = run_isolated(
+        *(jobs.match, manifest, folder / "features", tmp_path / "e" / "matches"),
+        look=SecondLook(FEATURES, tmp_path / "c", tmp_path / "unused"),
+    )
+    assert "8192" not in str(enough["decisions"]) and not (tmp_path / "unused").exists()
+
+
+def test_a_second_look_depends_on_strong_pairs():
+    names = [f"{i}.jpg" for i in range(12)]
+    ring = {(names[i - 1], names[i]): 30 for i in range(12)}
+    across = {(names[i - 2], names[i]): 30 for i in range(12)}
+    look = SecondLook(FEATURES, Path("cache"), Path("out"))
+    assert look.is_needed(names, ring), "two pairs each"
+    assert not look.is_needed(names, ring | across), "four pairs each"
+    assert look.is_needed(names, ring | dict.fromkeys(across, 29)), "two of them strong"
+    assert not look.is_needed(names[:2], {(names[0], names[1]): 30}), "there is one pair"
+    most = look.features.model_copy(update={"max_features": 8192})
+    assert not replace(look, features=most).is_needed(names, ring)
 
 
 def run_stages(scene: Path, results: Path) -> dict[str, dict]:

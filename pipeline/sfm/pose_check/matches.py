@@ -14,6 +14,7 @@ from pipeline.geometry.epipolar import consistent_matches
 from pipeline.geometry.rays import rays
 from pipeline.photos.threads import one_thread_of_opencv
 from pipeline.scene.manifest import Photo
+from pipeline.sfm.features import CONTRAST_THRESHOLD
 from pipeline.sfm.sift import DetectionImage, detect
 
 Array = NDArray[np.float64]
@@ -178,7 +179,7 @@ class PairFinder:
 
 def _features(photo: Photo) -> tuple[Array, NDArray[np.uint8]]:
     """(F, 2) pixels of the stored photograph and (F, 128) descriptors."""
-    found = detect(DetectionImage(photo, MAX_SIDE_PX), MAX_FEATURES)
+    found = detect(DetectionImage(photo, MAX_SIDE_PX), MAX_FEATURES, CONTRAST_THRESHOLD)
     return found.xy.astype(np.float64), found.descriptors
 
 

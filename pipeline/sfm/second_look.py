@@ -21,7 +21,7 @@ from pipeline.sfm.features import LOW_CONTRAST_THRESHOLD, extract_photos
 #: COLMAP's mapper to register the photograph by one of them (its default) are counted.
 MIN_STRONG_PAIRS, STRONG_INLIERS = 3, 30
 #: Largest share of weakly connected photographs without a second look.
-MAX_WEAK_SHARE = 0.08
+MAX_WEAK_SHARE = 0.05
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
 from pipeline.sfm.judge import Verdict, judge
+from pipeline.sfm.last_adjustment import adjust_last
 from pipeline.sfm.left_out import register_left_out
 from pipeline.sfm.matching import COLORS_FILE, list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
@@ -94,8 +95,8 @@ def reconstruct(
                 radial=config.refine_radial,
                 principal_point=config.refine_principal_point,
             )
-            model = refined.model
-            decisions += refined.decisions
+            model, adjustment = adjust_last(refined.model, refined.free_principal_points)
+            decisions += [*refined.decisions, adjustment]
             # The report describes the refined model.
             evidence = collect_evidence(model, attempt.database, total)
         else:

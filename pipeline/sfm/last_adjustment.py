@@ -1,8 +1,8 @@
 """The last bundle adjustment, by the keypoints that fit best.
 
-The residuals of SIFT keypoints have heavy tails: those of large scales, at edges of occlusion and on
-repeated texture are several times less accurate than the others. A Cauchy loss of the scale of the
-median residual gives them little weight, and halves the errors of the poses against one pixel.
+The residuals of SIFT keypoints have heavy tails: those of large scales and at edges of occlusion are
+several times less accurate than the others. A Cauchy loss of the scale of the median residual gives
+them little weight, and halves the errors of the poses against one pixel.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import pycolmap
 
 from pipeline.sfm.refine import EXACT_PX, bundle_adjust
 
-#: Observations with a larger reprojection error, and those behind their camera, are removed (COLMAP:
-#: ``filter_max_reproj_error``).
+#: Observations with a larger reprojection error, and those behind their camera, are removed
+#: (COLMAP: ``filter_max_reproj_error``).
 MAX_REPROJECTION_PX = 4.0
 #: Bounds of the scale of the loss, pixels: keypoints are hardly more accurate than the first.
 LOSS_PX = (0.05, 1.0)

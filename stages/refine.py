@@ -68,6 +68,6 @@ SPEC = StageSpec(
     decide=decide,
     counters=RefineCounters,
     inputs={"model": inputs.GIVEN},
-    options=("sfm.refine_radial", "sfm.refine_principal_point"),
+    options=("sfm.refine_principal_point",),
     packages=("pycolmap", "numpy", "scipy"),
 )

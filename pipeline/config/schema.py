@@ -198,11 +198,6 @@ class Sfm(Section):
         "group, folder if the photographs are in several folders, or image for collections from "
         "many cameras.",
     )
-    refine_radial: bool = Field(
-        True,
-        description="The last bundle adjustment turns SIMPLE_RADIAL cameras into RADIAL ones "
-        "if that lowers the error.",
-    )
     refine_principal_point: Literal["if_determined", "yes", "no"] = Field(
         "if_determined",
         description="if_determined: refined in the last bundle adjustment and kept if the geometry "

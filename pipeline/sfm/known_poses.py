@@ -63,7 +63,6 @@ def refine_known_poses(
     original = _positions(model, anchors)
     refined = refine(
         _longest_tracks(model, tracks, TRACKS_TO_DECIDE),
-        radial=config.refine_radial,
         principal_point=config.refine_principal_point,
         inner_iterations=True,
     )

@@ -92,7 +92,6 @@ def reconstruct(
         if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
             refined = refine(
                 model,
-                radial=config.refine_radial,
                 principal_point=config.refine_principal_point,
             )
             model, adjustment = adjust_last(refined.model, refined.free_principal_points)

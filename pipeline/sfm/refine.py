@@ -44,7 +44,6 @@ class Refined:
 def refine(
     model: pycolmap.Reconstruction,
     *,
-    radial: bool,
     principal_point: str,
     inner_iterations: bool = False,
 ) -> Refined:
@@ -55,7 +54,6 @@ def refine(
 
     Args:
         model: The model, which is not changed.
-        radial: Whether SIMPLE_RADIAL cameras may become RADIAL.
         principal_point: "yes" (always freed), "no", or "if_determined" (if it lowers the cost).
         inner_iterations: Whether ``bundle_adjust`` uses them.
     """
@@ -80,7 +78,7 @@ def refine(
     shared = shared or adjustable
     decisions: list[str] = []
     freed, free_principal_points = False, set[int]()
-    if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
+    if any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
         freer = pycolmap.Reconstruction(best)
         for camera_id in shared:
             _make_radial(freer.camera(camera_id))

@@ -38,7 +38,7 @@ def mapped(folder: Path) -> dict[str, Any]:
             pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), truth, database
         )
     best, attempts = map_until_good(path, "incremental", 8, 0.5, 0, 3)
-    refined = refine(best.models[0], radial=True, principal_point="if_determined")
+    refined = refine(best.models[0], principal_point="if_determined")
     errors = []
     ids = sorted(truth.reg_image_ids())
     for i in ids[1:]:

@@ -185,7 +185,6 @@ DRAWN = {
 
 CONDITIONAL = {
     "preset": "sets other options",
-    "sfm.refine_radial": "photographs of a lens that needs a second radial coefficient",
     "sfm.min_registered_share": "a model that lacks photographs, which is an error",
     "sfm.georeference": "photographs with GPS, or gcp_list.txt",
     "train.device": "a GPU (tests/training/test_device.py)",

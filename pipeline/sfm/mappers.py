@@ -39,7 +39,7 @@ def run_mapper(
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         run = _map_incremental if mapper == "incremental" else _map_global
-        models = run(_with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
+        models = run(with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
     smallest = min(MIN_MODEL_SIZE, total)
     models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
     # Among models with equally many images, the one with more points comes first.
@@ -47,7 +47,7 @@ def run_mapper(
     return models
 
 
-def _with_fisheye_priors(database: Path, folder: Path) -> Path:
+def with_fisheye_priors(database: Path, folder: Path) -> Path:
     """The database, or a copy in ``folder`` in which fisheye lenses have a prior: without one
     COLMAP ignores their pairs. Mapping refines the focal length in both cases."""
     with pycolmap.Database.open(database) as opened:
@@ -117,7 +117,7 @@ def continue_mapping(
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS_LATER
     options.triangulation.ignore_two_view_tracks = False
     found = pycolmap.incremental_mapping(
-        _with_fisheye_priors(database, folder), folder, folder, options, input_path=given
+        with_fisheye_priors(database, folder), folder, folder, options, input_path=given
     )
     return max(found.values(), key=lambda m: m.num_reg_images(), default=model)
 

@@ -1,0 +1,138 @@
+"""The components of a scene: the models into which its photographs fall.
+
+Models are joined where a joint is sound; the others are kept, and any of them can be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from pipeline.runtime.text import counted
+from pipeline.sfm.consistency import missing_covisibility
+from pipeline.sfm.evidence import collect_evidence, read_verified_pairs
+from pipeline.sfm.joining import join_models
+from pipeline.sfm.joints import Joint, find_joint
+from pipeline.sfm.judge import (
+    MAX_MISSING_COVISIBILITY,
+    MIN_AGREEING_PAIRS,
+    Evidence,
+    Verdict,
+    judge,
+)
+from pipeline.sfm.left_out import register_left_out
+from pipeline.sfm.matching import list_names
+from pipeline.sfm.model_views import read_views
+
+GRADES = ("failed", "weak", "good")
+# Largest share of neighbouring photographs across a joint that do not see the same points. Joints
+# are weak by nature, and the models apart from them are not: more are allowed than in a model.
+MAX_MISSING_ACROSS = 0.5
+
+
+@dataclass(frozen=True)
+class Component:
+    """A model with its quality."""
+
+    model: pycolmap.Reconstruction
+    evidence: Evidence
+    verdict: Verdict
+
+    @property
+    def photographs(self) -> set[int]:
+        """The ids of the registered images."""
+        return set(self.model.reg_image_ids())
+
+    @property
+    def alone(self) -> Verdict:
+        """The verdict on the model whatever its share of the photographs is."""
+        return judge(self.evidence.model_copy(update={"total": self.evidence.registered}), 0.0)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What models were mapped from.
+
+    Attributes:
+        database: The verified matches; not changed.
+        total: The number of photographs of the scene.
+        min_share: The share of registered images below which a model has failed.
+    """
+
+    database: Path
+    total: int
+    min_share: float
+    seed: int
+
+    def judged(self, model: pycolmap.Reconstruction) -> Component:
+        """A model with its quality."""
+        evidence = collect_evidence(model, self.database, self.total)
+        return Component(model, evidence, judge(evidence, self.min_share))
+
+    def completed(
+        self, main: Component, others: Sequence[pycolmap.Reconstruction]
+    ) -> tuple[Component, list[pycolmap.Reconstruction], list[str]]:
+        """Join other models and register further photographs, until neither adds any.
+
+        Returns:
+            The larger component, the models that hold photographs that it lacks, and the decisions.
+        """
+        waiting, decisions, grown = list(others), list[str](), True
+        while grown:
+            grown = False
+            waiting = [m for m in waiting if not set(m.reg_image_ids()) <= main.photographs]
+            for other in list(waiting):
+                if found := self._joined(main, other):
+                    new = len(found[0].photographs - main.photographs)
+                    main, joint = found
+                    waiting.remove(other)
+                    grown = True
+                    decisions.append(
+                        f"joined a model with {counted(new, 'further photograph')}: "
+                        f"{counted(len(joint.links), 'pair')} of photographs agree on the joint"
+                    )
+            more, late = register_left_out(main.model, self.database, self.seed)
+            if late and (found_late := self.judged(more)).alone.grade != "failed":
+                main = found_late
+                grown = True
+                decisions.append(
+                    f"registered in a second try, with fewer matches: {list_names(late)}"
+                )
+            grown = grown and bool(waiting)
+        return main, waiting, decisions
+
+    def _joined(
+        self, main: Component, other: pycolmap.Reconstruction
+    ) -> tuple[Component, Joint] | None:
+        """The component with the photographs of another model; None without a sound joint."""
+        with pycolmap.Database.open(self.database) as opened:
+            first, second = read_views(main.model, opened), read_views(other, opened)
+            pairs = read_verified_pairs(opened)
+        points = tuple({i: p.xyz for i, p in m.points3D.items()} for m in (main.model, other))
+        joint = find_joint(first, second, (points[0], points[1]), pairs)
+        if joint is None:
+            return None
+        joined = self.judged(join_models(main.model, other, joint, self.database))
+        with pycolmap.Database.open(self.database) as opened:
+            views = read_views(joined.model, opened)
+        across = missing_covisibility(joined.model, views, second.keys() - first.keys())
+        if across > MAX_MISSING_ACROSS or not _is_sound(joined, main, self.judged(other)):
+            return None
+        return joined, joint
+
+
+def _is_sound(joined: Component, main: Component, other: Component) -> bool:
+    """Whether a joined model has all photographs and is not worse than its parts: joining must not
+    fold look-alike places onto each other."""
+    parts = [main.evidence, other.evidence]
+    missing = max(MAX_MISSING_COVISIBILITY[1], *(part.missing_covisibility for part in parts))
+    agreeing = min(MIN_AGREEING_PAIRS[1], *(part.agreeing_pairs for part in parts))
+    return (
+        joined.photographs >= main.photographs | other.photographs
+        and GRADES.index(joined.alone.grade) >= GRADES.index(main.alone.grade)
+        and joined.evidence.missing_covisibility <= missing
+        and joined.evidence.agreeing_pairs >= agreeing
+    )

@@ -5,14 +5,16 @@ Models are joined where a joint is sound; the others are kept, and any of them c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
 from pipeline.runtime.text import counted
+from pipeline.sfm.attempts import Attempt
 from pipeline.sfm.consistency import missing_covisibility
+from pipeline.sfm.counters import ComponentSummary
 from pipeline.sfm.evidence import collect_evidence, read_verified_pairs
 from pipeline.sfm.joining import join_models
 from pipeline.sfm.joints import Joint, find_joint
@@ -28,9 +30,6 @@ from pipeline.sfm.matching import list_names
 from pipeline.sfm.model_views import read_views
 
 GRADES = ("failed", "weak", "good")
-# Largest share of neighbouring photographs across a joint that do not see the same points. Joints
-# are weak by nature, and the models apart from them are not: more are allowed than in a model.
-MAX_MISSING_ACROSS = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,17 @@ class Component:
     def photographs(self) -> set[int]:
         """The ids of the registered images."""
         return set(self.model.reg_image_ids())
+
+    def summary(self, folder: str) -> ComponentSummary:
+        """The component for ``stage.json``; ``folder``: where its model is."""
+        return ComponentSummary(
+            photographs=sorted(self.model.image(i).name for i in self.photographs),
+            num_points=int(self.model.num_points3D()),
+            mean_reprojection_error_px=float(self.model.compute_mean_reprojection_error()),
+            verdict=self.alone.grade,
+            reasons=self.alone.reasons,
+            folder=folder,
+        )
 
     @property
     def alone(self) -> Verdict:
@@ -70,7 +80,11 @@ class Capture:
     def judged(self, model: pycolmap.Reconstruction) -> Component:
         """A model with its quality."""
         evidence = collect_evidence(model, self.database, self.total)
-        return Component(model, evidence, judge(evidence, self.min_share))
+        return Component(model, evidence, self.verdict(evidence))
+
+    def verdict(self, evidence: Evidence) -> Verdict:
+        """The verdict on a model of the capture."""
+        return judge(evidence, self.min_share)
 
     def completed(
         self, main: Component, others: Sequence[pycolmap.Reconstruction]
@@ -119,9 +133,42 @@ class Capture:
         with pycolmap.Database.open(self.database) as opened:
             views = read_views(joined.model, opened)
         across = missing_covisibility(joined.model, views, second.keys() - first.keys())
-        if across > MAX_MISSING_ACROSS or not _is_sound(joined, main, self.judged(other)):
+        if across > MAX_MISSING_COVISIBILITY[0] or not _is_sound(joined, main, self.judged(other)):
             return None
         return joined, joint
+
+
+def find_components(
+    attempt: Attempt,
+    capture: Capture,
+    refine: Callable[[Component], tuple[Component, list[str]]],
+) -> tuple[list[Component], list[str]]:
+    """The components that an attempt found, and the decisions.
+
+    The first component is the attempt's largest model, refined and complete, unless it failed by
+    itself. The others follow by size: the attempt's own models, and those of other attempts that
+    are not failed and most of whose photographs no component has.
+
+    Args:
+        refine: Adjusts the cameras of a component; returns it and the decisions.
+    """
+    if attempt.evidence is None:
+        return [], []
+    main = Component(attempt.models[0], attempt.evidence, attempt.verdict)
+    rest, decisions = [*attempt.models[1:], *attempt.spare], list[str]()
+    if main.alone.grade != "failed":
+        main, decisions = refine(main)
+        main, rest, more = capture.completed(main, rest)
+        decisions += more
+    components, known = [main], main.photographs
+    for model in sorted(rest, key=lambda m: -m.num_reg_images()):
+        component = capture.judged(model)
+        new = len(component.photographs - known)
+        is_own = any(model is own for own in attempt.models)
+        if is_own or (2 * new >= len(component.photographs) and component.alone.grade != "failed"):
+            components.append(component)
+            known |= component.photographs
+    return components, decisions
 
 
 def _is_sound(joined: Component, main: Component, other: Component) -> bool:

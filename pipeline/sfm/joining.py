@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from pipeline.sfm.joints import Joint
@@ -34,16 +33,18 @@ def join_models(
     model = pycolmap.Reconstruction(first)
     registered = set(first.reg_image_ids())
     added = sorted(set(second.reg_image_ids()) - registered)
-    with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-        with pycolmap.Database.open(with_fisheye_priors(database, Path(folder))) as opened:
-            cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    with (
+        tempfile.TemporaryDirectory(dir=database.parent) as folder,
+        pycolmap.Database.open(with_fisheye_priors(database, Path(folder))) as opened,
+    ):
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
     cameras = set(model.cameras)
     model.load(cache)
     for image_id in added:
         image, old = model.image(image_id), moved.image(image_id)
         camera = moved.camera(old.camera_id)
         if image.camera_id not in cameras and camera.model == model.camera(image.camera_id).model:
-            model.camera(image.camera_id).params = camera.params
+            model.camera(image.camera_id).params = camera.params.tolist()
             cameras.add(image.camera_id)
         frame = model.frame(image.frame_id)
         frame.set_cam_from_world(image.camera_id, old.cam_from_world())

@@ -1,9 +1,9 @@
 """The similarity between two models of one scene, from what their photographs have in common.
 
 A keypoint that both models triangulated, or a verified match of a photograph of one model with a
-photograph of the other, gives a point in both worlds. Each pair of photographs is a link. Matches of
-look-alike places agree with a similarity as well as others do, therefore a joint needs several links
-of different photographs.
+photograph of the other, gives a point in both worlds. Each pair of photographs is a link. A wrong
+pair agrees with some similarity as well as a right one does: a joint needs several links of
+different photographs.
 """
 
 from __future__ import annotations
@@ -61,6 +61,17 @@ class _Correspondences(NamedTuple):
     bound_second: Floats
     link: NDArray[np.intp]
 
+    def chosen(self, rows: NDArray[np.bool_]) -> _Correspondences:
+        return _Correspondences(
+            self.first[rows],
+            self.second[rows],
+            self.centre_first[rows],
+            self.centre_second[rows],
+            self.bound_first[rows],
+            self.bound_second[rows],
+            self.link[rows],
+        )
+
     def agree(self, similarity: Similarity) -> NDArray[np.bool_]:
         """(N,) True where each point is seen where the other one is, by both cameras."""
         s = similarity
@@ -87,7 +98,7 @@ def find_joint(
     counted = np.flatnonzero(count >= MIN_CORRESPONDENCES)
     if len(counted) < MIN_LINKS:
         return None
-    found = _Correspondences(*(column[np.isin(found.link, counted)] for column in found))
+    found = found.chosen(np.isin(found.link, counted))
     similarity = _fit(found, len(links))
     if similarity is None:
         return None
@@ -128,7 +139,8 @@ def _correspondences(
     points: tuple[dict[int, Floats], dict[int, Floats]],
     links: list[_Link],
 ) -> _Correspondences:
-    rows: list[tuple[Floats | float, ...]] = []
+    places: list[Floats] = []
+    bounds, number = list[tuple[float, float]](), list[int]()
     for index, (a, b, left, right) in enumerate(links):
         one, other = first[a], second[b]
         ids_a, ids_b = one.observed[left], other.observed[right]
@@ -136,19 +148,26 @@ def _correspondences(
         if len(known) > MAX_CORRESPONDENCES:
             step = np.linspace(0, len(known) - 1, MAX_CORRESPONDENCES).round().astype(np.intp)
             known = known[step]
-        bounds = [MAX_ERROR * view.side / view.focal for view in (one, other)]
         for i, j in zip(ids_a[known].tolist(), ids_b[known].tolist(), strict=True):
-            rows.append((points[0][i], points[1][j], one.centre, other.centre, *bounds, index))
-    columns = [np.array(column, np.float64) for column in zip(*rows, strict=True)]
-    if not columns:
-        columns = [np.zeros((0, 3))] * 4 + [np.zeros(0)] * 3
-    return _Correspondences(*columns[:6], columns[6].astype(np.intp))
+            places.append(np.stack([points[0][i], points[1][j], one.centre, other.centre]))
+        bounds += [(_bound(one), _bound(other))] * len(known)
+        number += [index] * len(known)
+    xyz = np.array(places, np.float64).reshape(-1, 4, 3).transpose(1, 0, 2)
+    angles = np.array(bounds, np.float64).reshape(-1, 2).T
+    one_xyz, other_xyz, centre_a, centre_b = xyz
+    number_of_link = np.array(number, np.intp)
+    return _Correspondences(
+        one_xyz, other_xyz, centre_a, centre_b, angles[0], angles[1], number_of_link
+    )
+
+
+def _bound(view: ModelView) -> float:
+    return MAX_ERROR * view.side / view.focal
 
 
 def _fit(found: _Correspondences, num_links: int) -> Similarity | None:
     """The similarity that most correspondences agree with, each link counting alike (RANSAC), then
-    least squares on those that agree. The distance of a point from its camera is its weight: depths
-    are the less certain, the larger they are."""
+    least squares on those that agree."""
     rng = np.random.default_rng(0)
     weight = 1 / np.maximum(np.bincount(found.link, minlength=num_links), 1)[found.link]
     best, most = None, 0.0

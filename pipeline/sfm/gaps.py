@@ -10,9 +10,9 @@ import pycolmap
 from pipeline.sfm.components import Component
 from pipeline.sfm.counters import Gap
 
-# Unrelated photographs have a few matches by chance: a lone one must have more in common with one
-# that is placed.
-MIN_MATCHES = 12
+# Smallest number of matches of a lone photograph with one that is placed. Unrelated photographs
+# have fewer by chance.
+MIN_MATCHES = 25
 # Largest number of lone photographs that are listed.
 MAX_LONE = 5
 

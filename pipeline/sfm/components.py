@@ -94,27 +94,40 @@ class Capture:
         Returns:
             The larger component, the models that hold photographs that it lacks, and the decisions.
         """
+        decisions, grown = list[str](), True
+        while grown:
+            main, others, joints = self.with_joined(main, others)
+            decisions += joints
+            more, late = register_left_out(main.model, self.database, self.seed)
+            found = self.judged(more) if late else main
+            grown = bool(late) and found.alone.grade != "failed"
+            if grown:
+                main = found
+                decisions.append(
+                    f"registered in a second try, with fewer matches: {list_names(late)}"
+                )
+            grown = grown and bool(others)
+        return main, list(others), decisions
+
+    def with_joined(
+        self, main: Component, others: Sequence[pycolmap.Reconstruction]
+    ) -> tuple[Component, list[pycolmap.Reconstruction], list[str]]:
+        """As ``completed``, by joining other models alone."""
         waiting, decisions, grown = list(others), list[str](), True
         while grown:
             grown = False
-            waiting = [m for m in waiting if not set(m.reg_image_ids()) <= main.photographs]
             for other in list(waiting):
-                if found := self._joined(main, other):
-                    new = len(found[0].photographs - main.photographs)
+                new = len(set(other.reg_image_ids()) - main.photographs)
+                found = self._joined(main, other) if new else None
+                if found:
                     main, joint = found
-                    waiting.remove(other)
                     grown = True
                     decisions.append(
                         f"joined a model with {counted(new, 'further photograph')}: "
                         f"{counted(len(joint.links), 'pair')} of photographs agree on the joint"
                     )
-            more, late = register_left_out(main.model, self.database, self.seed)
-            if late and (found_late := self.judged(more)).alone.grade != "failed":
-                main = found_late
-                grown = True
-                decisions.append(
-                    f"registered in a second try, with fewer matches: {list_names(late)}"
-                )
+                if found or not new:
+                    waiting.remove(other)
             grown = grown and bool(waiting)
         return main, waiting, decisions
 
@@ -161,11 +174,17 @@ def find_components(
         main, rest, more = capture.completed(main, rest)
         decisions += more
     components, known = [main], main.photographs
-    for model in sorted(rest, key=lambda m: -m.num_reg_images()):
-        component = capture.judged(model)
-        new = len(component.photographs - known)
+    rest.sort(key=lambda model: -model.num_reg_images())
+    while rest:
+        model, *rest = rest
+        new = len(set(model.reg_image_ids()) - known)
         is_own = any(model is own for own in attempt.models)
-        if is_own or (2 * new >= len(component.photographs) and component.alone.grade != "failed"):
+        if not new or not (is_own or 2 * new >= model.num_reg_images()):
+            continue
+        component = capture.judged(model)
+        if is_own or component.alone.grade != "failed":
+            component, rest, more = capture.with_joined(component, rest)
+            decisions += more
             components.append(component)
             known |= component.photographs
     return components, decisions

@@ -129,7 +129,7 @@ class Gap(BaseModel):
 
     def advice(self) -> str:
         """What to photograph."""
-        what = "it" if self.component is None else f"component {self.component}"
+        what = self.other if self.component is None else f"component {self.component}"
         return f"take photographs between {self.placed} and {self.other} to join {what}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
@@ -21,6 +22,11 @@ MAX_PHOTOS_WITH_ALL_POINTS = 200
 
 # Smallest number of matches by which a photograph is registered in a finished model (COLMAP: 30).
 MIN_INLIERS_LATER = 15
+
+# Number of states of a model that incremental mapping saves on its way, and the smallest number of
+# photographs between them. COLMAP discards a model if a late adjustment loses most of its
+# photographs: the state before holds at least this share of photographs that no model has.
+SNAPSHOTS, MIN_SNAPSHOT, MIN_LOST_SHARE = 10, 10, 0.2
 
 # Global mapping uses the longest tracks only: several times faster at the same accuracy.
 GLOBAL_TRACKS_PER_VIEW = 300
@@ -80,6 +86,10 @@ def _map_incremental(
     # Two-view tracks nearly double the number of points, from which Gaussians are initialised.
     options.triangulation.ignore_two_view_tracks = False
     options.mapper.ba_global_ignore_redundant_points3D = total > MAX_PHOTOS_WITH_ALL_POINTS
+    states = out / "states"
+    states.mkdir()
+    options.snapshot_path = states
+    options.snapshot_frames_freq = max(MIN_SNAPSHOT, total // SNAPSHOTS)
     progress = Progress("mapping", total, "photographs")
 
     def registered() -> None:
@@ -90,7 +100,28 @@ def _map_incremental(
     models = pycolmap.incremental_mapping(
         database, out, out, options, next_image_callback=registered
     )
-    return [models[key] for key in sorted(models)]
+    found = [models[key] for key in sorted(models)]
+    return found + lost_model(states, found, total)
+
+
+def lost_model(
+    states: Path, models: Sequence[pycolmap.Reconstruction], total: int
+) -> list[pycolmap.Reconstruction]:
+    """The largest saved state of a model, if many of its photographs are in no model.
+
+    Args:
+        states: The folder with a folder for each state.
+        total: The number of photographs in the database.
+    """
+    kept = {image_id for model in models for image_id in model.reg_image_ids()}
+    if total - len(kept) < MIN_LOST_SHARE * total:
+        return []
+    saved = [pycolmap.Reconstruction(folder) for folder in sorted(states.iterdir())]
+    largest = max(saved, key=lambda model: model.num_reg_images(), default=None)
+    if largest is None:
+        return []
+    lost = set(largest.reg_image_ids()) - kept
+    return [largest] if len(lost) >= MIN_LOST_SHARE * largest.num_reg_images() else []
 
 
 def continue_mapping(

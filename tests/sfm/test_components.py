@@ -134,3 +134,33 @@ def test_every_component_is_kept_and_any_can_be_used(tmp_path):
             assert sorted(names) == component["photographs"]
     with pytest.raises(UserError, match=r"sfm\.component is 2, but the photographs gave 2 comp"):
         run_isolated(jobs.reconstruct, written.manifest, database, Sfm(component=2), tmp_path)
+
+
+def lost_after(folder: Path, kept: int) -> list[int]:
+    """The sizes of the models that are restored, of saved states of 5 and 8 photographs, if mapping
+    kept a model of the first ``kept`` of them."""
+    import pycolmap
+
+    from pipeline.sfm.mappers import lost_model
+
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8, num_points3D=50
+    )
+    model = pycolmap.synthesize_dataset(options)
+    states = folder / "states"
+
+    def first(count: int) -> Any:
+        part = pycolmap.Reconstruction(model)
+        for frame_id in sorted(model.reg_frame_ids())[count:]:
+            part.deregister_frame(frame_id)
+        return part
+
+    for name, count in (("1", 5), ("2", 8)):
+        (states / name).mkdir(parents=True)
+        first(count).write_binary(states / name)
+    return [m.num_reg_images() for m in lost_model(states, [first(kept)] if kept else [], 8)]
+
+
+@pytest.mark.parametrize(("kept", "restored"), [(0, [8]), (3, [8]), (7, []), (8, [])])
+def test_a_model_that_mapping_discarded_late_is_its_last_saved_state(tmp_path, kept, restored):
+    assert run_isolated(lost_after, tmp_path, kept) == restored

@@ -28,6 +28,7 @@ from pipeline.sfm.judge import (
 from pipeline.sfm.left_out import register_left_out
 from pipeline.sfm.matching import list_names
 from pipeline.sfm.model_views import read_views
+from pipeline.sfm.refine import bundle_adjust
 
 GRADES = ("failed", "weak", "good")
 
@@ -99,6 +100,8 @@ class Capture:
             main, others, joints = self.with_joined(main, others)
             decisions += joints
             more, late = register_left_out(main.model, self.database, self.seed)
+            if late:
+                bundle_adjust(more, focal=False)
             found = self.judged(more) if late else main
             grown = bool(late) and found.alone.grade != "failed"
             if grown:

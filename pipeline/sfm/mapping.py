@@ -195,12 +195,12 @@ def _warnings(counters: SfmCounters, verdict: Verdict, used: int) -> Iterator[st
         yield f"{len(missing)} of {counters.total} photographs have no pose: {list_names(missing)}"
     if len(counters.components) > 1:
         sizes = ", ".join(
-            f"{index}: {len(component.photographs)}"
+            f"{index}: {counted(len(component.photographs), 'photograph')}"
             for index, component in enumerate(counters.components)
         )
         yield (
             f"the photographs gave {len(counters.components)} components that could not be joined "
-            f"(photographs of each: {sizes}); component {used} is used, the others are in "
+            f"({sizes}); component {used} is used, the others are in "
             "other_models; set sfm.component to use another one (to improve it: "
             f"{'; '.join(gap.advice() for gap in counters.gaps) or OVERLAP})"
         )
@@ -229,6 +229,8 @@ def _failure(
         if index and component.alone.grade != "failed"
     ]
     other = [f"set sfm.component to use another component: {', '.join(usable)}"] if usable else []
+    if components and components[0].alone.grade != "failed":
+        other.append("lower sfm.min_registered_share to use component 0")
     return UserError(
         f"no reconstruction{count}: {'; '.join(found.verdict.reasons)}",
         fix="; ".join([*found.verdict.remedies, *other, KNOWN_POSES_HINT]),

@@ -60,6 +60,8 @@ class Component:
     @property
     def alone(self) -> Verdict:
         """The verdict on the model whatever its share of the photographs is."""
+        if self.verdict.grade == "good":
+            return self.verdict
         return judge(self.evidence.model_copy(update={"total": self.evidence.registered}), 0.0)
 
 

@@ -103,7 +103,7 @@ class Capture:
             decisions += joints
             more, late = register_left_out(main.model, self.database, self.seed)
             if late:
-                bundle_adjust(more, focal=False)
+                bundle_adjust(more, focal=False, distortion=False)
             found = self.judged(more) if late else main
             grown = bool(late) and found.alone.grade != "failed"
             if grown:

@@ -34,7 +34,8 @@ SFM = SfmCounters(
     mean_reprojection_error_px=0.5,
     num_points=4000,
     mean_track_length=4.0,
-    other_models=[],
+    components=[],
+    gaps=[],
     cameras=[
         CameraSummary(
             camera_id=1,

@@ -206,6 +206,11 @@ class Sfm(Section):
     min_registered_share: Share = Field(
         0.5, description="A model with a smaller share of registered photographs is an error."
     )
+    component: Annotated[int, Field(ge=0, le=MAX_PHOTOS), Unit("number")] = Field(
+        0,
+        description="Which part of the scene is used if the photographs fall into several that "
+        "cannot be joined: 0 is the largest. sfm/stage.json lists them.",
+    )
     georeference: Literal["auto", "gps", "gcp", "none"] = Field(
         "auto",
         description="Coordinate frame of the model. gcp: metres in the projection of gcp_list.txt "

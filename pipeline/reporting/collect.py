@@ -62,6 +62,8 @@ def collect_metrics(
             "reprojection_error_px": sfm.mean_reprojection_error_px if sfm else error_px,
             "sfm_verdict": sfm.verdict if sfm else None,
             "georeference": sfm.georeference if sfm else None,
+            "components": sfm.components if sfm else [],
+            "gaps": sfm.gaps if sfm else [],
             "stages": {
                 name: {"skipped": not step.run, "reason": step.reason, "jobs": step.jobs}
                 for name, step in plan.stages.items()

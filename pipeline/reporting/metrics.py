@@ -16,6 +16,7 @@ from pipeline.plan.values import job_folders
 from pipeline.runtime.json_file import JsonFile, JsonObject
 from pipeline.runtime.record import RunRecord, read_run
 from pipeline.scene.georeference import GeoreferenceSummary
+from pipeline.sfm.counters import ComponentSummary, Gap
 
 
 class StageStatus(JsonObject):
@@ -47,6 +48,12 @@ class Metrics(JsonFile, SceneQuality):
     sfm_verdict: str | None = Field(description="good, weak or failed; null for given poses.")
     georeference: GeoreferenceSummary | None = Field(
         description="The world's frame, from sfm; null for given poses."
+    )
+    components: list[ComponentSummary] = Field(
+        [], description="The parts of the scene that could not be joined; empty for given poses."
+    )
+    gaps: list[Gap] = Field(
+        [], description="What to photograph to join the other parts to the one that is used."
     )
     stages: dict[str, StageStatus] = Field(description="By name of the stage.")
     versions: dict[str, str] = Field(description="Package to its version.")

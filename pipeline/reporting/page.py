@@ -118,7 +118,7 @@ def _missing(results: SceneResults) -> set[str]:
     record = results.coverage.record
     present = {
         "pictures": results.comparisons,
-        "coverage": record.viewpoints,
+        "coverage": record.viewpoints or results.metrics.gaps,
         "trust": not record.reason,
         "training": results.curve,
         "views": results.metrics.per_view,

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -44,6 +44,7 @@ class Attempt:
         models: The models found, largest first.
         evidence, verdict: The quality of the largest model.
         database: The database that was mapped.
+        spare: The models of other attempts with photographs that no model of this one has.
     """
 
     mapper: Mapper
@@ -52,6 +53,7 @@ class Attempt:
     evidence: Evidence | None
     verdict: Verdict
     database: Path
+    spare: Sequence[pycolmap.Reconstruction] = ()
 
     def record(self, taken: bool) -> AttemptRecord:
         """The attempt for ``stage.json``; ``taken``: whether its model is used."""
@@ -101,7 +103,18 @@ def map_until_good(
         attempts.append(attempt)
         if _rank(attempt) > _rank(best):
             best = attempt
-    return best, [attempt.record(attempt is best) for attempt in attempts]
+    records = [attempt.record(attempt is best) for attempt in attempts]
+    return replace(best, spare=_spare(best, attempts)), records
+
+
+def _spare(best: Attempt, attempts: Sequence[Attempt]) -> list[pycolmap.Reconstruction]:
+    registered = {image_id for model in best.models for image_id in model.reg_image_ids()}
+    return [
+        model
+        for attempt in attempts
+        for model in attempt.models
+        if not set(model.reg_image_ids()) <= registered
+    ]
 
 
 def _alternatives(

@@ -12,6 +12,7 @@ Two statistics that expose a bent or folded model even if its reprojection error
 
 from __future__ import annotations
 
+from collections.abc import Set
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ def measure_consistency(
     return Consistency(
         agreeing_matches=agreeing / max(matches, 1),
         agreeing_pairs=sum(strong_pairs_agree) / max(len(strong_pairs_agree), 1),
-        missing_covisibility=_missing_covisibility(model, list(views.values())),
+        missing_covisibility=missing_covisibility(model, views),
     )
 
 
@@ -122,18 +123,27 @@ def _directions(view: ModelView, chosen: NDArray[np.uint32], wide: bool) -> Floa
     return flat / np.linalg.norm(flat, axis=1, keepdims=True) if wide else flat
 
 
-def _missing_covisibility(model: pycolmap.Reconstruction, views: list[ModelView]) -> float:
+def missing_covisibility(
+    model: pycolmap.Reconstruction,
+    by_id: dict[int, ModelView],
+    across: Set[int] = frozenset(),
+) -> float:
     """Share of neighbouring images whose expected common points are mostly not observed.
 
     Shares of observed points are compared among pairs of the same kinds of images: a panorama
     observes few of the points of a photograph, which has several times its angular resolution.
+
+    Args:
+        by_id: The registered images by their ids.
+        across: Only pairs of an image in this set with another one are counted, if it has any.
     """
+    views, counted = list(by_id.values()), [image_id in across for image_id in by_id]
     if len(views) < 2:
         return 0.0
     centres = np.stack([view.centre for view in views])
     point_ids = np.array(sorted(model.points3D), np.int64)
     xyz = np.stack([model.point3D(int(i)).xyz for i in point_ids])
-    shares: dict[tuple[bool, bool], list[float]] = {}
+    shares: dict[tuple[bool, bool], list[tuple[float, bool]]] = {}
     for i, j in proximity_pairs(centres, _axes(views), NEIGHBOURS):
         for one, other in ((views[i], views[j]), (views[j], views[i])):
             observed = xyz[np.searchsorted(point_ids, one.points)]
@@ -141,11 +151,14 @@ def _missing_covisibility(model: pycolmap.Reconstruction, views: list[ModelView]
             if expected.sum() >= MIN_EXPECTED_POINTS:
                 common = np.isin(one.points[expected], other.points, assume_unique=True)
                 kinds = one.is_panorama, other.is_panorama
-                shares.setdefault(kinds, []).append(float(common.mean()))
+                shares.setdefault(kinds, []).append(
+                    (float(common.mean()), not across or counted[i] != counted[j])
+                )
     missing = [
-        share < COVISIBLE_SHARE * np.percentile(of_kinds, 75)
+        share < COVISIBLE_SHARE * np.percentile([share for share, _ in of_kinds], 75)
         for of_kinds in shares.values()
-        for share in of_kinds
+        for share, is_counted in of_kinds
+        if is_counted
     ]
     return float(np.mean(missing)) if missing else 0.0
 

@@ -100,6 +100,39 @@ class AttemptRecord(BaseModel):
     taken: bool = Field(description="Whether the stage uses the model of this attempt.")
 
 
+class ComponentSummary(BaseModel):
+    """A part of the scene whose photographs are placed relative to each other."""
+
+    model_config = StageCounters.model_config
+
+    photographs: list[str] = Field(description="Names of its photographs.")
+    num_points: int = Field(ge=0, description="Number of sparse points.")
+    mean_reprojection_error_px: float = Field(description="Mean reprojection error, pixels.")
+    verdict: Grade = Field(
+        description="Quality of the component by itself, whatever its share of the photographs is."
+    )
+    reasons: list[str] = Field(description="The defects found; empty for a good one.")
+    folder: str = Field(
+        description="Where its COLMAP model is in the stage's folder: `sparse/0` is used."
+    )
+
+
+class Gap(BaseModel):
+    """Two photographs of parts that are not joined, which have more in common than others."""
+
+    model_config = StageCounters.model_config
+
+    placed: str = Field(description="A photograph of the model that is used.")
+    other: str = Field(description="A photograph of another component, or one without a pose.")
+    component: int | None = Field(description="The component of `other`; null if it is in none.")
+    matches: int = Field(ge=0, description="Number of their matches, verified or not.")
+
+    def advice(self) -> str:
+        """What to photograph."""
+        what = self.other if self.component is None else f"component {self.component}"
+        return f"take photographs between {self.placed} and {self.other} to join {what}"
+
+
 class SfmCounters(StageCounters):
     """Counters of the sfm stage."""
 
@@ -110,8 +143,12 @@ class SfmCounters(StageCounters):
     mean_reprojection_error_px: float = Field(description="Mean reprojection error, pixels.")
     num_points: int = Field(ge=0, description="Number of sparse points.")
     mean_track_length: float = Field(description="Mean number of observations per point.")
-    other_models: list[int] = Field(
-        description="Number of images in each of the smaller models, which `other_models` has."
+    components: list[ComponentSummary] = Field(
+        description="The models that could not be joined; `sfm.component` chooses one by its place."
+    )
+    gaps: list[Gap] = Field(
+        description="What to photograph to join the other components and the photographs without a "
+        "pose to the model that is used."
     )
     cameras: list[CameraSummary] = Field(description="The model's cameras.")
     verdict: Grade = Field(description="Quality of the model; a failed one ends the stage.")

@@ -63,7 +63,7 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=None if agrees_with_exif or not relative else _focal_certainty(model),
+        focal_certainty=None if agrees_with_exif or not relative else focal_certainty(model),
         focal_relative=float(np.median(relative)) if relative else None,
     )
 
@@ -220,7 +220,7 @@ def _rotated_onto(a: Floats, b: Floats) -> Floats:
     return np.asarray(a @ np.swapaxes(u @ vt, -1, -2))
 
 
-def _focal_certainty(model: pycolmap.Reconstruction) -> float:
+def focal_certainty(model: pycolmap.Reconstruction) -> float:
     """Smallest relative increase of the robust cost if the focal lengths are held 20% smaller or
     larger while all other parameters are adjusted. Near 0, the images do not determine the focal
     length (fronto-parallel planes, pure rotation, forward motion)."""

@@ -22,13 +22,17 @@ LOSS_PX = (0.05, 1.0)
 
 
 def adjust_last(
-    model: pycolmap.Reconstruction, free_principal_points: Set[int]
+    model: pycolmap.Reconstruction,
+    free_principal_points: Set[int] = frozenset(),
+    *,
+    cameras: bool = True,
 ) -> tuple[pycolmap.Reconstruction, str]:
     """Remove gross outliers and adjust poses, points and cameras with a narrow robust loss.
 
     Args:
         model: An adjusted model, which is not changed.
         free_principal_points: The ids of the cameras whose principal points are refined.
+        cameras: Whether focal lengths and distortions are refined.
 
     Returns:
         The model and a sentence for the log.
@@ -41,7 +45,7 @@ def adjust_last(
     if error < EXACT_PX:
         return adjusted, f"{removed} outliers removed; the other tracks fit exactly"
     loss = float(np.clip(error, *LOSS_PX))
-    bundle_adjust(adjusted, free_principal_points, loss_px=loss)
+    bundle_adjust(adjusted, free_principal_points, focal=cameras, distortion=cameras, loss_px=loss)
     return adjusted, (
         f"last bundle adjustment with a Cauchy loss of {loss:.2f} px, {removed} outliers removed"
     )

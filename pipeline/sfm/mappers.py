@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
@@ -22,6 +23,11 @@ MAX_PHOTOS_WITH_ALL_POINTS = 200
 # Smallest number of matches by which a photograph is registered in a finished model (COLMAP: 30).
 MIN_INLIERS_LATER = 15
 
+# Number of states of a model that incremental mapping saves on its way, and the smallest number of
+# photographs between them. COLMAP discards a model if a late adjustment loses most of its
+# photographs: the state before holds at least this share of photographs that no model has.
+SNAPSHOTS, MIN_SNAPSHOT, MIN_LOST_SHARE = 10, 10, 0.2
+
 # Global mapping uses the longest tracks only: several times faster at the same accuracy.
 GLOBAL_TRACKS_PER_VIEW = 300
 
@@ -39,7 +45,7 @@ def run_mapper(
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         run = _map_incremental if mapper == "incremental" else _map_global
-        models = run(_with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
+        models = run(with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
     smallest = min(MIN_MODEL_SIZE, total)
     models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
     # Among models with equally many images, the one with more points comes first.
@@ -47,7 +53,7 @@ def run_mapper(
     return models
 
 
-def _with_fisheye_priors(database: Path, folder: Path) -> Path:
+def with_fisheye_priors(database: Path, folder: Path) -> Path:
     """The database, or a copy in ``folder`` in which fisheye lenses have a prior: without one
     COLMAP ignores their pairs. Mapping refines the focal length in both cases."""
     with pycolmap.Database.open(database) as opened:
@@ -80,6 +86,10 @@ def _map_incremental(
     # Two-view tracks nearly double the number of points, from which Gaussians are initialised.
     options.triangulation.ignore_two_view_tracks = False
     options.mapper.ba_global_ignore_redundant_points3D = total > MAX_PHOTOS_WITH_ALL_POINTS
+    states = out / "states"
+    states.mkdir()
+    options.snapshot_path = states
+    options.snapshot_frames_freq = max(MIN_SNAPSHOT, total // SNAPSHOTS)
     progress = Progress("mapping", total, "photographs")
 
     def registered() -> None:
@@ -90,7 +100,28 @@ def _map_incremental(
     models = pycolmap.incremental_mapping(
         database, out, out, options, next_image_callback=registered
     )
-    return [models[key] for key in sorted(models)]
+    found = [models[key] for key in sorted(models)]
+    return found + lost_model(states, found, total)
+
+
+def lost_model(
+    states: Path, models: Sequence[pycolmap.Reconstruction], total: int
+) -> list[pycolmap.Reconstruction]:
+    """The largest saved state of a model, if many of its photographs are in no model.
+
+    Args:
+        states: The folder with a folder for each state.
+        total: The number of photographs in the database.
+    """
+    kept = {image_id for model in models for image_id in model.reg_image_ids()}
+    if total - len(kept) < MIN_LOST_SHARE * total:
+        return []
+    saved = [pycolmap.Reconstruction(folder) for folder in sorted(states.iterdir())]
+    largest = max(saved, key=lambda model: model.num_reg_images(), default=None)
+    if largest is None:
+        return []
+    lost = set(largest.reg_image_ids()) - kept
+    return [largest] if len(lost) >= MIN_LOST_SHARE * largest.num_reg_images() else []
 
 
 def continue_mapping(
@@ -117,7 +148,7 @@ def continue_mapping(
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS_LATER
     options.triangulation.ignore_two_view_tracks = False
     found = pycolmap.incremental_mapping(
-        _with_fisheye_priors(database, folder), folder, folder, options, input_path=given
+        with_fisheye_priors(database, folder), folder, folder, options, input_path=given
     )
     return max(found.values(), key=lambda m: m.num_reg_images(), default=model)
 

@@ -9,7 +9,8 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,24 @@ import pycolmap
 from pipeline.config import settled
 from pipeline.runtime.counters import Report
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import counted
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
+from pipeline.sfm.components import Capture, Component, find_components
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
-from pipeline.sfm.evidence import collect_evidence, focal_priors
-from pipeline.sfm.judge import Verdict, judge
+from pipeline.sfm.evidence import focal_priors
+from pipeline.sfm.gaps import find_gaps
+from pipeline.sfm.judge import Verdict
 from pipeline.sfm.last_adjustment import adjust_last
-from pipeline.sfm.left_out import register_left_out
 from pipeline.sfm.matching import COLORS_FILE, list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
 from pipeline.sfm.refine import refine
+from pipeline.sfm.weak import refine_weak
 
+USED_FOLDER = "sparse/0"
+OVERLAP = "take photographs that show parts of both"
 KNOWN_POSES_HINT = "or give known poses (sparse/0, transforms.json)"
 
 
@@ -40,19 +46,19 @@ class MappedScene:
 
     Attributes:
         report: The counters and messages of the stage.
-        models: The models found, with coloured points: the first one is used.
-        georeference: The world frame of the first model.
+        models: The models by their folders, with coloured points.
+        georeference: The world frame of the model that is used.
     """
 
     report: Report[SfmCounters]
-    models: list[pycolmap.Reconstruction]
+    models: dict[str, pycolmap.Reconstruction]
     georeference: Georeference
 
     def write(self, out: Path) -> None:
-        """Write the model to ``out/sparse/0``, the other models to ``out/other_models/<n>`` and the
-        world frame to ``out/georeference.json``."""
-        for index, model in enumerate(self.models):
-            write_model(model, out / (f"other_models/{index}" if index else "sparse/0"))
+        """Write the model to ``out/sparse/0``, the other components to ``out/other_models/<n>`` and
+        the world frame to ``out/georeference.json``."""
+        for folder, model in self.models.items():
+            write_model(model, out / folder)
         self.georeference.write(out)
 
 
@@ -73,7 +79,8 @@ def reconstruct(
         ground_control: The scene's ``gcp_list.txt``; None without one.
 
     Raises:
-        UserError: Every attempt failed the quality check (see ``judge``).
+        UserError: Every attempt failed the quality check (see ``judge``), or there is no component
+            of the number ``sfm.component``.
     """
     quiet_colmap()
     total = len(manifest.photos)
@@ -86,66 +93,116 @@ def reconstruct(
             work, config.mapper, total, config.min_registered_share, seed
         )
         decisions = [_describe(record, total) for record in attempts]
-        if attempt.verdict.grade == "failed" or attempt.evidence is None:
-            raise _failure(attempt, attempts)
-        model, evidence = attempt.models[0], attempt.evidence
-        if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
-            refined = refine(
-                model,
-                principal_point=config.refine_principal_point,
-            )
-            model, adjustment = adjust_last(refined.model, refined.free_principal_points)
-            decisions += [*refined.decisions, adjustment]
-            # The report describes the refined model.
-            evidence = collect_evidence(model, attempt.database, total)
-        else:
-            decisions.append("cameras not refined further: the model is weak and would overfit")
-        verdict = attempt.verdict
-        more, late = register_left_out(model, attempt.database, seed)
-        found = collect_evidence(more, attempt.database, total) if late else evidence
-        judged = judge(found, config.min_registered_share)
-        if late and judged.grade != "failed":
-            model, evidence, verdict = more, found, judged
-            decisions.append(f"registered in a second try, with fewer matches: {list_names(late)}")
-        cameras = _camera_summaries(model, focal_priors(attempt.database))
+        capture = Capture(attempt.database, total, config.min_registered_share, seed)
+        components, more = find_components(attempt, capture, partial(_refined, config, capture))
+        chosen, chosen_by = _choose(components, capture, config)
+        decisions += more + chosen_by
+        if chosen is None or chosen.verdict.grade == "failed":
+            raise _failure(chosen or attempt, attempts, components)
+        components[config.component] = chosen
+        gaps = find_gaps(capture.database, components, config.component)
+        cameras = _camera_summaries(chosen.model, focal_priors(capture.database))
+    model = chosen.model
     frame = align_model(model, manifest, config.georeference, ground_control)
-    models = [model, *attempt.models[1:]]
     if colors := _read_colors(database.with_name(COLORS_FILE)):
-        for each in models:
-            color_points(each, colors)
+        for component in components:
+            color_points(component.model, colors)
     registered = {model.image(i).name for i in model.reg_image_ids()}
-    missing = [photo.name for photo in manifest.photos if photo.name not in registered]
-    sizes = [int(other.num_reg_images()) for other in models[1:]]
     georeference = frame.georeference()
     counters = SfmCounters(
         mapper=attempt.mapper,
         registered=len(registered),
         total=total,
-        not_registered=missing,
+        not_registered=[p.name for p in manifest.photos if p.name not in registered],
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
         num_points=int(model.num_points3D()),
         mean_track_length=float(model.compute_mean_track_length()),
-        other_models=sizes,
+        components=[
+            component.summary(_folder(index, config.component))
+            for index, component in enumerate(components)
+        ],
+        gaps=gaps,
         cameras=cameras,
-        verdict=verdict.grade,
-        evidence=evidence,
+        verdict=chosen.verdict.grade,
+        evidence=chosen.evidence,
         attempts=attempts,
         georeference=georeference.summary(),
     )
-    warnings += [*frame.warnings, *_warnings(counters, verdict)]
+    warnings += [*frame.warnings, *_warnings(counters, chosen.verdict, config.component)]
     return MappedScene(
-        Report(counters, decisions + frame.decisions, warnings), models, georeference
+        Report(counters, decisions + frame.decisions, warnings),
+        {_folder(i, config.component): each.model for i, each in enumerate(components)},
+        georeference,
     )
 
 
-def _warnings(counters: SfmCounters, verdict: Verdict) -> Iterator[str]:
+def _folder(component: int, used: int) -> str:
+    return USED_FOLDER if component == used else f"other_models/{component}"
+
+
+def _refined(
+    config: settled.Sfm, capture: Capture, component: Component
+) -> tuple[Component, list[str]]:
+    """The component with refined cameras, and the decisions."""
+    alone = component.alone.grade
+    if alone == "good" or config.refine_principal_point == "yes":
+        refined = refine(component.model, principal_point=config.refine_principal_point)
+        model, last = adjust_last(refined.model, refined.free_principal_points)
+        decisions = [*refined.decisions, last]
+    else:
+        refined = refine_weak(component.model, focal_priors(capture.database))
+        model, decisions = refined.model, refined.decisions
+    # The report describes the refined model.
+    found = capture.judged(model)
+    if alone == "good":
+        return replace(found, verdict=component.verdict), decisions
+    # A focal length that was set to that of EXIF is no evidence that it is right.
+    kept = component.evidence.model_dump(include={"focal_off", "focal_certainty"})
+    evidence = found.evidence.model_copy(update=kept)
+    return Component(found.model, evidence, capture.verdict(evidence)), decisions
+
+
+def _choose(
+    components: list[Component], capture: Capture, config: settled.Sfm
+) -> tuple[Component | None, list[str]]:
+    """The component that is used, complete, and the decisions; None without a model.
+
+    Raises:
+        UserError: ``sfm.component`` is larger than the number of components allows.
+    """
+    index = config.component
+    if index == 0:
+        return (components[0] if components else None), []
+    if index >= len(components):
+        raise UserError(
+            f"sfm.component is {index}, but the photographs gave "
+            f"{counted(len(components), 'component')}",
+            fix=f"set sfm.component to a number below {max(len(components), 1)}",
+        )
+    # It was chosen in spite of its share of the photographs.
+    any_share = replace(capture, min_share=0.0)
+    chosen = any_share.judged(components[index].model)
+    if chosen.verdict.grade == "failed":
+        return chosen, []
+    chosen, decisions = _refined(config, any_share, chosen)
+    chosen, _, more = any_share.completed(chosen, [])
+    size = counted(len(chosen.photographs), "photograph")
+    return chosen, [f"component {index} of {size} is used (sfm.component)", *decisions, *more]
+
+
+def _warnings(counters: SfmCounters, verdict: Verdict, used: int) -> Iterator[str]:
     if missing := counters.not_registered:
         yield f"{len(missing)} of {counters.total} photographs have no pose: {list_names(missing)}"
-    if others := counters.other_models:
+    if len(counters.components) > 1:
+        sizes = ", ".join(
+            f"{index}: {counted(len(component.photographs), 'photograph')}"
+            for index, component in enumerate(counters.components)
+        )
         yield (
-            f"the photographs gave {len(others) + 1} unconnected models: the largest "
-            f"({counters.registered} photographs) is used; the others "
-            f"({', '.join(map(str, others))}) are in other_models"
+            f"the photographs gave {len(counters.components)} components that could not be joined "
+            f"({sizes}); component {used} is used, the others are in "
+            "other_models; set sfm.component to use another one (to improve it: "
+            f"{'; '.join(gap.advice() for gap in counters.gaps) or OVERLAP})"
         )
     if verdict.grade == "weak":
         yield (
@@ -162,11 +219,21 @@ def _describe(record: AttemptRecord, total: int) -> str:
     return f"{record.mapper} mapping{change}: {size}, {record.verdict}{reasons}{taken}"
 
 
-def _failure(attempt: Attempt, attempts: list[AttemptRecord]) -> UserError:
+def _failure(
+    found: Attempt | Component, attempts: list[AttemptRecord], components: list[Component]
+) -> UserError:
     count = f" after {len(attempts)} attempts" if len(attempts) > 1 else ""
+    usable = [
+        f"{index} ({counted(len(component.photographs), 'photograph')})"
+        for index, component in enumerate(components)
+        if index and component.alone.grade != "failed"
+    ]
+    other = [f"set sfm.component to use another component: {', '.join(usable)}"] if usable else []
+    if components and components[0].alone.grade != "failed":
+        other.append("lower sfm.min_registered_share to use component 0")
     return UserError(
-        f"no reconstruction{count}: {'; '.join(attempt.verdict.reasons)}",
-        fix="; ".join([*attempt.verdict.remedies, KNOWN_POSES_HINT]),
+        f"no reconstruction{count}: {'; '.join(found.verdict.reasons)}",
+        fix="; ".join([*found.verdict.remedies, *other, KNOWN_POSES_HINT]),
     )
 
 

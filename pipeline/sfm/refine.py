@@ -109,6 +109,8 @@ def bundle_adjust(
     model: pycolmap.Reconstruction,
     free_principal_point: Set[int] = frozenset(),
     *,
+    focal: bool = True,
+    distortion: bool = True,
     loss_px: float = 1.0,
     tolerance: float = FUNCTION_TOLERANCE,
     inner_iterations: bool = False,
@@ -118,6 +120,7 @@ def bundle_adjust(
     Args:
         free_principal_point: The ids of cameras whose principal points are refined. If any, the
             intrinsics of all other cameras are constant.
+        focal, distortion: Whether focal lengths and distortions are refined.
         loss_px: The scale of the Cauchy loss, pixels.
         tolerance: The relative decrease of the cost at which the solver stops (Ceres'
             ``function_tolerance``).
@@ -128,6 +131,7 @@ def bundle_adjust(
         The final cost.
     """
     options = _options(loss_px, tolerance)
+    options.refine_focal_length, options.refine_extra_params = focal, distortion
     options.refine_principal_point = bool(free_principal_point)
     if inner_iterations and _block_order_is_unique(model):
         options.ceres.solver_options.use_inner_iterations = True

@@ -125,6 +125,29 @@ def test_the_worst_novel_view_is_shown_with_its_contradictions() -> None:
     assert "contradicted in 10 novel views" in text and "beside 5.7%, behind 0.0%" in text
 
 
+def test_components_and_what_would_join_them_are_on_the_page() -> None:
+    parts = [
+        {
+            "photographs": names,
+            "num_points": points,
+            "mean_reprojection_error_px": 0.25,
+            "verdict": "good",
+            "reasons": [],
+            "folder": folder,
+        }
+        for names, points, folder in (
+            (["a.jpg", "c.jpg"], 4321, "sparse/0"),
+            (["d.jpg", "f.jpg", "g.jpg"], 876, "other_models/1"),
+        )
+    ]
+    gap = {"placed": "c.jpg", "other": "d.jpg", "component": 1, "matches": 9}
+    found = metrics(components=parts, gaps=[gap])
+    text = Page(report_html(report(metrics=found))).all_text()
+    assert "1 3 876 0.25 px good sfm/other_models/1 d.jpg, g.jpg" in text
+    assert "Between c.jpg and d.jpg: joins component 1 (3 photographs)" in text
+    assert "sfm.component" in text
+
+
 def test_no_string_of_the_user_becomes_markup() -> None:
     plain = metrics()
     stages = {

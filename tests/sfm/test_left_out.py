@@ -1,20 +1,28 @@
 """Photographs that mapping left out: a second try registers those that few matches determine, and
-none that its pairs contradict."""
+none that its pairs contradict or that match by chance."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipeline.runtime.isolate import run_isolated
 
 #: Matches of the last photograph: enough for the second try, too few for the first.
 FEW = 22
+#: Right and wrong matches of each pair of the last photograph that is not verified.
+RIGHT, WRONG = 4, 8
 
 
-def map_twice(folder: Path, *, contradicted: bool) -> dict[str, Any]:
-    """Map a synthetic scene whose last photograph has few matches, with each of the others. If it
-    is contradicted, those with all but two of them are wrong."""
+def map_twice(folder: Path, kind: str) -> dict[str, Any]:
+    """Map a synthetic scene whose last photograph has few matches, with each of the others.
+
+    Args:
+        kind: "few"; "contradicted": the matches with all but two of the others are wrong;
+            "unverified": no pair is, and a third of the matches is right; "chance": none is.
+    """
     import numpy as np
     import pycolmap
 
@@ -50,9 +58,16 @@ def map_twice(folder: Path, *, contradicted: bool) -> dict[str, Any]:
                 continue
             side = pair.index(last)
             matches = geometry.inlier_matches
+            if kind in ("unverified", "chance"):
+                right = rng.permutation(matches)[: RIGHT if kind == "unverified" else 0]
+                wrong = np.stack([rng.permutation(column)[:WRONG] for column in matches.T], axis=1)
+                database.delete_two_view_geometry(*pair)
+                database.delete_matches(*pair)
+                database.write_matches(*pair, np.concatenate([right, wrong]))
+                continue
             few = matches[[int(match[side]) in column for match in matches]]
             seen += 1
-            if contradicted and seen > 2:
+            if kind == "contradicted" and seen > 2:
                 few[:, side] = rng.permutation(few[:, side])
             geometry.inlier_matches = few
             database.update_two_view_geometry(*pair, geometry)
@@ -88,13 +103,15 @@ def map_twice(folder: Path, *, contradicted: bool) -> dict[str, Any]:
     }
 
 
-def test_few_matches_register_a_photograph_in_a_finished_model(tmp_path: Path) -> None:
-    found = run_isolated(map_twice, tmp_path, contradicted=False)
+@pytest.mark.parametrize("kind", ["few", "unverified"])
+def test_few_matches_register_a_photograph_in_a_finished_model(tmp_path: Path, kind: str) -> None:
+    found = run_isolated(map_twice, tmp_path, kind)
     assert found["first"] == 7 and found["registered"] == 8
     assert found["names"] == [found["last"]] and found["off"] < 0.02
     assert found["moved"] < 1e-9 and all(found["repeated"])
 
 
-def test_a_photograph_that_its_pairs_contradict_stays_out(tmp_path: Path) -> None:
-    found = run_isolated(map_twice, tmp_path, contradicted=True)
+@pytest.mark.parametrize("kind", ["contradicted", "chance"])
+def test_a_photograph_that_its_pairs_contradict_stays_out(tmp_path: Path, kind: str) -> None:
+    found = run_isolated(map_twice, tmp_path, kind)
     assert found["first"] == found["registered"] == 7 and not found["names"]

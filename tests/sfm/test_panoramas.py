@@ -96,12 +96,12 @@ def test_panoramas_that_only_turn_have_no_parallax() -> None:
 
 
 def covisibility(folded: bool) -> float:
-    """``_missing_covisibility`` of photographs and panoramas side by side, which observe six and
+    """``missing_covisibility`` of photographs and panoramas side by side, which observe six and
     one of ten points. ``folded``: every other photograph observes points of its own."""
     import numpy as np
     import pycolmap
 
-    from pipeline.sfm.consistency import _missing_covisibility
+    from pipeline.sfm.consistency import missing_covisibility
     from pipeline.sfm.model_views import ModelView
 
     rng = np.random.default_rng(0)
@@ -125,7 +125,7 @@ def covisibility(folded: bool) -> float:
         seen = rng.choice(own, len(own) * (1 if panorama else 6) // 10, replace=False)
         pose = rotation, np.array([0, 0, 3.0])
         views.append(ModelView(cameras[panorama], *pose, np.zeros((len(seen), 2)), seen))
-    return _missing_covisibility(model, views)
+    return missing_covisibility(model, dict(enumerate(views)))
 
 
 def test_photographs_among_panoramas_share_few_points_with_them() -> None:

@@ -93,7 +93,8 @@ def test_of_two_scenes_in_one_folder_the_larger_is_used_with_a_warning(room, tmp
     assert (
         "into 2 separate groups" in matched["warnings"][0] and "8 of 12" in matched["warnings"][0]
     )
-    assert report["registered"] == 8 and report["other_models"] == [4]
+    assert report["registered"] == 8
+    assert [len(component["photographs"]) for component in report["components"]] == [8, 4]
     assert report["not_registered"] == [photo.name for photo in others]
     assert report["verdict"] == "weak"
     assert len(read_model(tmp_path / "sfm" / "other_models" / "1").images) == 4

@@ -186,6 +186,7 @@ DRAWN = {
 CONDITIONAL = {
     "preset": "sets other options",
     "sfm.min_registered_share": "a model that lacks photographs, which is an error",
+    "sfm.component": "photographs that fall into several components",
     "sfm.georeference": "photographs with GPS, or gcp_list.txt",
     "train.device": "a GPU (tests/training/test_device.py)",
     "train.density.pixels_per_gaussian": "views of more than 40 000 pixels",

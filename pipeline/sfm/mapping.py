@@ -22,6 +22,7 @@ from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
+from pipeline.sfm.continuity import sequence_steps
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
 from pipeline.sfm.judge import Verdict, judge
@@ -75,14 +76,14 @@ def reconstruct(
         UserError: Every attempt failed the quality check (see ``judge``).
     """
     quiet_colmap()
-    total = len(manifest.photos)
+    total, steps = len(manifest.photos), sequence_steps(manifest.photos)
     with tempfile.TemporaryDirectory(prefix="splatmake-sfm-") as folder:
         # Opening a database can change its bytes: work on a copy.
         work = Path(folder) / "database.db"
         shutil.copyfile(database, work)
         warnings = _check_complete(manifest, work)
         attempt, attempts = map_until_good(
-            work, config.mapper, total, config.min_registered_share, seed
+            work, config.mapper, total, config.min_registered_share, seed, steps=steps
         )
         decisions = [_describe(record, total) for record in attempts]
         if attempt.verdict.grade == "failed" or attempt.evidence is None:
@@ -97,12 +98,12 @@ def reconstruct(
             model = refined.model
             decisions += refined.decisions
             # The report describes the refined model.
-            evidence = collect_evidence(model, attempt.database, total)
+            evidence = collect_evidence(model, attempt.database, total, steps)
         else:
             decisions.append("cameras not refined further: the model is weak and would overfit")
         verdict = attempt.verdict
         more, late = register_left_out(model, attempt.database, seed)
-        found = collect_evidence(more, attempt.database, total) if late else evidence
+        found = collect_evidence(more, attempt.database, total, steps) if late else evidence
         judged = judge(found, config.min_registered_share)
         if late and judged.grade != "failed":
             model, evidence, verdict = more, found, judged

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.demo.cameras import lens, look_at
 from pipeline.demo.shapes import Array, Box, Cylinder, Shape, Sphere

@@ -1,8 +1,8 @@
 """Mapping attempts: if the first model is not good, map again with another mapper or other cameras.
 
 Attempts differ in the mapper, in the initial camera parameters, or in the verified pairs that they
-use: pairs of parts that look alike are left out. More features or more pairs need other stages: the message of a failure names the
-options.
+use: pairs of parts that look alike are left out. More features or more pairs need other stages: the
+message of a failure names the options.
 """
 
 from __future__ import annotations

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.sfm.model_views import Pairs
 
-# A pair is distinctive if it shares at least this part of the weight that the best pairs of its
-# photographs share, the smaller of both.
-DISTINCTIVE_SHARE = 0.4
+# A pair is distinctive if it is among so many best pairs of both its photographs.
+BEST_PAIRS = 2
 # The weight of a keypoint falls with this power of the number of photographs that it matches.
 RARITY_POWER = 2
 
@@ -27,15 +26,11 @@ def distinctive_pairs(pairs: Pairs) -> set[tuple[int, int]]:
         pairs: The verified matches of all pairs.
     """
     share = _shared_weight(pairs)
-    best: dict[int, float] = {}
-    for pair, value in share.items():
+    best: dict[int, list[tuple[int, int]]] = {}
+    for pair in sorted(share, key=lambda pair: (-share[pair], pair)):
         for image in pair:
-            best[image] = max(best.get(image, 0.0), value)
-    return {
-        pair
-        for pair, value in share.items()
-        if value >= DISTINCTIVE_SHARE * min(best[pair[0]], best[pair[1]])
-    }
+            best.setdefault(image, []).append(pair)
+    return {pair for pair in share if all(pair in best[image][:BEST_PAIRS] for image in pair)}
 
 
 def _shared_weight(pairs: Pairs) -> dict[tuple[int, int], float]:

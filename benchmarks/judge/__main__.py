@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks import record_tables
 from benchmarks.judge.cases import CASES, make
+from benchmarks.judge.look_alikes import LOOK_ALIKES, write_look_alikes
 from benchmarks.judge.pictures import PICTURES, Matched, match_folder, write_pictures
 from benchmarks.judge.truth import Truth, grade
 from benchmarks.judge.world import write
@@ -30,6 +31,8 @@ from pipeline.sfm.models import quiet_colmap, write_model
 SHOWN = (
     ("explained_matches", "expl", "{:.2f}"),
     ("agreeing_pairs", "agree", "{:.2f}"),
+    ("agreeing_distinctive", "dist", "{:.2f}"),
+    ("broken_steps", "brk", "{:.0f}"),
     ("missing_covisibility", "miss", "{:.2f}"),
     ("observations_per_image", "obs", "{:.0f}"),
     ("parallax", "parlx", "{:.4f}"),
@@ -37,6 +40,9 @@ SHOWN = (
     ("focal_certainty", "fcert", "{:.2f}"),
     ("focal_off", "foff", "{:.2f}"),
 )
+
+
+ALL_CASES = (*CASES, *PICTURES, *LOOK_ALIKES)
 
 
 def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) -> JudgeResult:
@@ -57,7 +63,13 @@ def run_folder(
     """Match and map a folder of photographs by the plan of the pipeline."""
     start = time.process_time()
     best, records = map_until_good(
-        found.database, mapper or found.mapper, found.total, found.min_share, seed, budget
+        found.database,
+        mapper or found.mapper,
+        found.total,
+        found.min_share,
+        seed,
+        budget,
+        found.steps,
     )
     truth = None
     if found.truth is not None:
@@ -92,15 +104,16 @@ def _row(
 
 
 def rows(args: argparse.Namespace) -> Iterator[JudgeResult]:
-    names = [*CASES, *PICTURES] if args.cases is None else args.cases
+    names = [*CASES, *PICTURES, *LOOK_ALIKES] if args.cases is None else args.cases
     for seed in args.seeds:
         for name in names:
             with tempfile.TemporaryDirectory(prefix="judge-") as temporary:
                 folder = Path(temporary)
                 if name in CASES:
                     yield run_made(name, seed, args.mapper, args.budget, folder)
-                elif name in PICTURES:
-                    run_isolated(write_pictures, name, seed, folder / name)
+                else:
+                    render = write_pictures if name in PICTURES else write_look_alikes
+                    run_isolated(render, name, seed, folder / name)
                     found = match_folder(folder / name, folder, seed)
                     yield run_folder(name, seed, found, args.mapper, args.budget)
     for photographs in args.data:
@@ -132,7 +145,7 @@ def _seeds(text: str) -> list[int]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.judge", description=__doc__)
-    parser.add_argument("--cases", nargs="*", help=f"of {', '.join([*CASES, *PICTURES])}")
+    parser.add_argument("--cases", nargs="*", help=f"of {', '.join(ALL_CASES)}")
     parser.add_argument("--seeds", type=_seeds, default=[0], help="one, or first-last")
     parser.add_argument(
         "--data", nargs="*", type=Path, default=[], help="scenes' folders, or results/NAME"
@@ -143,7 +156,7 @@ def main() -> int:
     )
     add_record_options(parser)
     args = parser.parse_args()
-    unknown = set(args.cases or []) - {*CASES, *PICTURES}
+    unknown = set(args.cases or []) - set(ALL_CASES)
     if unknown:
         parser.error(f"no such case: {', '.join(sorted(unknown))}")
     quiet_colmap()

@@ -17,6 +17,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.record import read_stage
 from pipeline.scene.manifest import Manifest
+from pipeline.sfm.continuity import Names, sequence_steps
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.second_look import SecondLook
@@ -41,6 +42,7 @@ class Matched:
     mapper: Mapper
     min_share: float
     truth: Path | None
+    steps: tuple[Names, ...] = ()
 
 
 def write_pictures(name: str, seed: int, folder: Path) -> None:
@@ -99,6 +101,7 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
         mapper,
         settled.sfm.min_registered_share,
         truth_folder(folder),
+        tuple(sequence_steps(manifest.photos)),
     )
 
 
@@ -107,12 +110,14 @@ def _finished(folder: Path, work: Path) -> Matched:
     database = work / "database.db"
     shutil.copyfile(folder / "matches" / "database.db", database)
     truth = folder / "inspect" / "truth"
+    photos = Manifest.read(folder / "inspect" / "images.json").photos
     return Matched(
         database,
-        len(Manifest.read(folder / "inspect" / "images.json").photos),
+        len(photos),
         config["mapper"],
         config["min_registered_share"],
         truth if truth.is_dir() else None,
+        tuple(sequence_steps(photos)),
     )
 
 

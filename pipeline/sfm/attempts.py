@@ -1,8 +1,8 @@
 """Mapping attempts: if the first model is not good, map again with another mapper or other cameras.
 
-All attempts use the same verified matches. They differ in the mapper or in the initial camera
-parameters. More features or more pairs need other stages: the message of a failure names the
-options.
+Attempts differ in the mapper, in the initial camera parameters, or in the verified pairs that they
+use: pairs of parts that look alike are left out. More features or more pairs need other stages: the
+message of a failure names the options.
 """
 
 from __future__ import annotations
@@ -12,14 +12,23 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import pycolmap
 
+from pipeline.sfm.continuity import Names
 from pipeline.sfm.counters import AttemptRecord, Mapper
 from pipeline.sfm.database import share_cameras_by_size
 from pipeline.sfm.evidence import collect_evidence
-from pipeline.sfm.judge import Evidence, Verdict, judge
+from pipeline.sfm.judge import (
+    MAX_MISSING_COVISIBILITY,
+    MIN_AGREEING_PAIRS,
+    Evidence,
+    Verdict,
+    judge,
+)
+from pipeline.sfm.look_alikes import leave_out_look_alikes
 from pipeline.sfm.mappers import run_mapper
 from pipeline.sfm.models import DEFAULT_FOCAL_FACTOR, uncalibrated
 
@@ -74,6 +83,7 @@ def map_until_good(
     min_share: float,
     seed: int,
     budget: int = MAX_ATTEMPTS,
+    steps: Sequence[Names] = (),
 ) -> tuple[Attempt, list[AttemptRecord]]:
     """Map a scene until a model is good.
 
@@ -84,13 +94,25 @@ def map_until_good(
         total: The number of photographs of the scene.
         min_share: The share of registered images below which a model has failed.
         budget: The maximum number of attempts.
+        steps: The result of ``sequence_steps``.
 
     Returns:
         The best attempt and the records of all attempts, in order.
     """
-    best = _attempt(database, first, "", total, min_share, seed)
+
+    def attempt_with(path: Path, mapper: Mapper, change: str) -> Attempt:
+        models = run_mapper(mapper, path, total, seed)
+        evidence = collect_evidence(models[0], path, total, steps) if models else None
+        return Attempt(mapper, change, models, evidence, judge(evidence, min_share), path)
+
+    def leave_out(target: Path) -> bool:
+        return leave_out_look_alikes(database, frozenset(steps), total, seed, target)
+
+    best = attempt_with(database, first, "")
     attempts = [best]
-    for mapper, change, prepare in _alternatives(database, first):
+    for mapper, change, prepare in chain(
+        _without_look_alikes(best, leave_out), _alternatives(database, first)
+    ):
         is_final = best.verdict.grade == "good" or not best.verdict.worth_retrying
         if is_final or len(attempts) >= budget:
             break
@@ -99,7 +121,7 @@ def map_until_good(
             path = database.with_name(f"attempt_{len(attempts)}.db")
             if not prepare(path):
                 continue
-        attempt = _attempt(path, mapper, change, total, min_share, seed)
+        attempt = attempt_with(path, mapper, change)
         attempts.append(attempt)
         if _rank(attempt) > _rank(best):
             best = attempt
@@ -151,12 +173,17 @@ def _alternatives(
         yield first, "fisheye cameras", fisheye
 
 
-def _attempt(
-    database: Path, mapper: Mapper, change: str, total: int, min_share: float, seed: int
-) -> Attempt:
-    models = run_mapper(mapper, database, total, seed)
-    evidence = collect_evidence(models[0], database, total) if models else None
-    return Attempt(mapper, change, models, evidence, judge(evidence, min_share), database)
+def _without_look_alikes(
+    first: Attempt, leave_out: Callable[[Path], bool]
+) -> Iterator[tuple[Mapper, str, Callable[[Path], bool] | None]]:
+    """As ``_alternatives``, if the first model may be folded."""
+    e = first.evidence
+    if e is not None and (
+        e.broken_steps
+        or min(e.agreeing_pairs, e.agreeing_distinctive) < MIN_AGREEING_PAIRS[1]
+        or e.missing_covisibility > MAX_MISSING_COVISIBILITY[1]
+    ):
+        yield first.mapper, "pairs left out that contradict the most distinctive ones", leave_out
 
 
 def _rank(attempt: Attempt) -> tuple[int, float]:

@@ -14,6 +14,7 @@ import pycolmap
 from pipeline.runtime.text import counted
 from pipeline.sfm.attempts import Attempt
 from pipeline.sfm.consistency import missing_covisibility
+from pipeline.sfm.continuity import Names
 from pipeline.sfm.counters import ComponentSummary
 from pipeline.sfm.evidence import collect_evidence, read_verified_pairs
 from pipeline.sfm.joining import join_models
@@ -74,16 +75,18 @@ class Capture:
         database: The verified matches; not changed.
         total: The number of photographs of the scene.
         min_share: The share of registered images below which a model has failed.
+        steps: The result of ``sequence_steps``.
     """
 
     database: Path
     total: int
     min_share: float
     seed: int
+    steps: tuple[Names, ...] = ()
 
     def judged(self, model: pycolmap.Reconstruction) -> Component:
         """A model with its quality."""
-        evidence = collect_evidence(model, self.database, self.total)
+        evidence = collect_evidence(model, self.database, self.total, self.steps)
         return Component(model, evidence, self.verdict(evidence))
 
     def verdict(self, evidence: Evidence) -> Verdict:

@@ -51,19 +51,24 @@ class Consistency(NamedTuple):
 
     agreeing_matches: float
     agreeing_pairs: float
+    agreeing_distinctive: float
     missing_covisibility: float
 
 
 def measure_consistency(
-    model: pycolmap.Reconstruction, views: dict[int, ModelView], pairs: Pairs
+    model: pycolmap.Reconstruction,
+    views: dict[int, ModelView],
+    pairs: Pairs,
+    distinctive: set[tuple[int, int]],
 ) -> Consistency:
     """Compute the two-view consistency of ``model``.
 
     Args:
         views: The registered images.
         pairs: Verified matches of pairs of registered images.
+        distinctive: The result of ``distinctive_pairs``, of all images.
     """
-    agreeing, matches, strong_pairs_agree = 0, 0, []
+    agreeing, matches, strong_pairs_agree, distinctive_agree = 0, 0, [], []
     strongest: dict[int, int] = {}
     for pair, inliers in pairs.items():
         for image_id in pair:
@@ -72,11 +77,14 @@ def measure_consistency(
         agree = _matches_agree(views[first], views[second], inliers)
         agreeing += int(agree.sum())
         matches += len(agree)
+        if (first, second) in distinctive:
+            distinctive_agree.append(bool(agree.mean() >= MIN_AGREEING_SHARE))
         if len(agree) >= STRONG_SHARE * min(strongest[first], strongest[second]):
             strong_pairs_agree.append(bool(agree.mean() >= MIN_AGREEING_SHARE))
     return Consistency(
         agreeing_matches=agreeing / max(matches, 1),
         agreeing_pairs=sum(strong_pairs_agree) / max(len(strong_pairs_agree), 1),
+        agreeing_distinctive=sum(distinctive_agree) / max(len(distinctive_agree), 1),
         missing_covisibility=missing_covisibility(model, views),
     )
 

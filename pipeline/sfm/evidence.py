@@ -3,6 +3,7 @@ database."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -11,7 +12,9 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.sfm.consistency import measure_consistency
+from pipeline.sfm.consistency import measure_consistency, pair_agrees
+from pipeline.sfm.continuity import Names, broken_steps
+from pipeline.sfm.distinctive import distinctive_pairs
 from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
 from pipeline.sfm.model_views import Floats, ModelView, Pairs, read_views
 
@@ -29,19 +32,35 @@ PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 FOCAL_STEP, FOCAL_IMAGES, FOCAL_ITERATIONS = 1.2, 30, 8
 
 
-def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int) -> Evidence:
+def collect_evidence(
+    model: pycolmap.Reconstruction, database: Path, total: int, steps: Sequence[Names] = ()
+) -> Evidence:
     """Compute the statistics of ``model``.
 
     Args:
         database: The database that the model was mapped from.
         total: The number of photographs of the scene.
+        steps: The result of ``sequence_steps``.
     """
     with pycolmap.Database.open(database) as opened:
         verified = read_verified_pairs(opened)
         views = read_views(model, opened)
+        names = {image.image_id: image.name for image in opened.read_all_images()}
     pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
     behind, observations, angles = _geometry(model, views)
-    consistency = measure_consistency(model, views, pairs)
+    consistency = measure_consistency(model, views, pairs, distinctive_pairs(verified))
+    ids = {name: image_id for image_id, name in names.items()}
+
+    def agrees(pair: Names) -> bool | None:
+        first, second = sorted(ids[name] for name in pair)
+        matches = pairs.get((first, second))
+        return None if matches is None else pair_agrees(views[first], views[second], matches)
+
+    broken = broken_steps(
+        {names[i]: view.rotation for i, view in views.items()},
+        agrees,
+        steps,
+    )
     flat = [view for view in views.values() if not view.is_panorama]
     relative = [view.focal / view.longer_side for view in flat]
     priors = focal_priors(database)
@@ -59,6 +78,7 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         reprojection_px=float(model.compute_mean_reprojection_error()),
         explained_matches=_explained_matches(views, pairs),
         **consistency._asdict(),
+        broken_steps=len(broken),
         behind_camera=behind,
         parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,

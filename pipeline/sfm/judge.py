@@ -21,6 +21,7 @@ Grade = Literal["good", "weak", "failed"]
 MIN_EXPLAINED = (0.20, 0.40)
 MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
+MIN_AGREEING_DISTINCTIVE = (0.94, 0.98)
 MAX_MISSING_COVISIBILITY = (0.35, 0.15)
 # A model that exceeds both is folded, although each alone would only be weak.
 FOLDED_AGREEING, FOLDED_MISSING_COVISIBILITY = 0.97, 0.15
@@ -81,6 +82,14 @@ class Evidence(BaseModel):
     )
     agreeing_pairs: float = Field(
         description="Share of the strong pairs of which at least half of the matches agree."
+    )
+    agreeing_distinctive: float = Field(
+        description="Share of the distinctive pairs of which at least half of the matches agree. "
+        "Distinctive pairs share what few other images show, hence they are no look-alikes."
+    )
+    broken_steps: int = Field(
+        description="Number of steps between neighbours of a sequence at which the model turns the "
+        "camera far more than the sequence does, although verified pairs connect both sides."
     )
     missing_covisibility: float = Field(
         description="Share of neighbouring images that should observe many common points and "
@@ -203,6 +212,12 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
             _REPEATED,
         ),
         _Finding(
+            e.agreeing_distinctive < MIN_AGREEING_DISTINCTIVE[level],
+            f"{1 - e.agreeing_distinctive:.0%} of the pairs that share what no other photograph "
+            "shows contradict the model: different parts that look alike may have been merged",
+            _REPEATED,
+        ),
+        _Finding(
             e.missing_covisibility > MAX_MISSING_COVISIBILITY[level] and not (failed and folded),
             f"{e.missing_covisibility:.0%} of neighbouring photographs do not see the same points: "
             "different parts that look alike may have been merged",
@@ -226,6 +241,12 @@ def _failures(e: Evidence) -> list[_Finding]:
             and not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
             f"the focal length is {e.focal_relative or 0:.2f} times the image's longer side",
             _FOCAL,
+        ),
+        _Finding(
+            e.broken_steps > 0,
+            f"the camera turns abruptly at {e.broken_steps} step(s) of a sequence whose "
+            "photographs overlap: different parts that look alike may have been merged",
+            _REPEATED,
         ),
         _Finding(
             e.behind_camera > MAX_BEHIND,

@@ -25,6 +25,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.components import Capture, Component, find_components
+from pipeline.sfm.continuity import sequence_steps
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import focal_priors
 from pipeline.sfm.gaps import find_gaps
@@ -83,17 +84,17 @@ def reconstruct(
             of the number ``sfm.component``.
     """
     quiet_colmap()
-    total = len(manifest.photos)
+    total, steps = len(manifest.photos), sequence_steps(manifest.photos)
     with tempfile.TemporaryDirectory(prefix="splatmake-sfm-") as folder:
         # Opening a database can change its bytes: work on a copy.
         work = Path(folder) / "database.db"
         shutil.copyfile(database, work)
         warnings = _check_complete(manifest, work)
         attempt, attempts = map_until_good(
-            work, config.mapper, total, config.min_registered_share, seed
+            work, config.mapper, total, config.min_registered_share, seed, steps=steps
         )
         decisions = [_describe(record, total) for record in attempts]
-        capture = Capture(attempt.database, total, config.min_registered_share, seed)
+        capture = Capture(attempt.database, total, config.min_registered_share, seed, tuple(steps))
         components, more = find_components(attempt, capture, partial(_refined, config, capture))
         chosen, chosen_by = _choose(components, capture, config)
         decisions += more + chosen_by

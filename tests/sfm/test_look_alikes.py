@@ -1,0 +1,69 @@
+"""Look-alikes: distinctive pairs, and the continuity of sequences."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from pipeline.scene.manifest import Photo
+from pipeline.sfm.continuity import broken_steps, sequence_steps
+from pipeline.sfm.distinctive import distinctive_pairs
+
+
+def test_pairs_of_a_repeated_part_are_not_distinctive():
+    """Eight photographs on a ring: all share 100 keypoints of a repeated part, neighbours share 40
+    keypoints more. By their numbers of matches alone, the pairs differ little."""
+    repeated = np.arange(100)
+    pairs = {}
+    for i in range(8):
+        for j in range(i + 1, 8):
+            a = b = repeated
+            if j - i in (1, 7):
+                first, second = (i, j) if j - i == 1 else (j, i)
+                own = {first: np.arange(100, 140), second: np.arange(140, 180)}
+                a, b = np.concatenate([a, own[i]]), np.concatenate([b, own[j]])
+            pairs[i, j] = np.column_stack([a, b]).astype(np.uint32)
+    ring = {(i, i + 1) for i in range(7)} | {(0, 7)}
+    assert distinctive_pairs(pairs) == ring
+
+
+def photo(name: str, group: str = "") -> Photo:
+    return Photo(name=name, path=name, width=4, height=3, digest="", camera_group=group)
+
+
+def test_sequences_are_frames_of_one_video():
+    frames = [photo(f"{v}/{i:06d}.png", f"{v} 4x3") for v in ("a.mp4", "b.mp4") for i in (0, 7, 9)]
+    expected = [
+        (f"{v}/{i:06d}.png", f"{v}/{j:06d}.png")
+        for v in ("a.mp4", "b.mp4")
+        for i, j in ((0, 7), (7, 9))
+    ]
+    assert sequence_steps([*frames, photo("x.jpg"), photo("y.jpg"), photo("z.jpg")]) == expected
+    named = [photo(f"frame_{i:03d}.jpg") for i in range(3)]
+    assert sequence_steps(named) == [
+        ("frame_000.jpg", "frame_001.jpg"),
+        ("frame_001.jpg", "frame_002.jpg"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("yaws", "agrees", "expected"),
+    [
+        ((0, 10, 20, 30, 40), False, 0),  # Smooth.
+        ((0, 10, 20, 200, 210), False, 1),  # Folded: pairs contradict the jump.
+        ((0, 10, 20, 200, 210), None, 0),  # A cut.
+        ((0, 10, 20, 200, 210), True, 0),  # The camera turned.
+        ((0, 10, 200, 30, 40), False, 0),  # One stray photograph.
+        ((0, 60, 120, 180, 240), False, 0),  # Photographs far apart, evenly.
+    ],
+)
+def test_a_jump_that_pairs_contradict_breaks_a_sequence(yaws, agrees, expected):
+    names = [f"{i}" for i in range(5)]
+    rotations = {}
+    for name, degrees in zip(names, yaws, strict=True):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        rotations[name] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    steps = list(itertools.pairwise(names))
+    assert broken_steps(rotations, lambda pair: agrees, steps) == [("2", "3")] * expected

@@ -16,7 +16,6 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.config import settled
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
-from pipeline.config.schema import MORE_FEATURES
 from pipeline.runtime.counters import Report
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
@@ -34,12 +33,7 @@ from pipeline.sfm.fisheye import set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.models import is_uncalibrated, quiet_colmap, set_focal
 from pipeline.sfm.pair_list import PairList
-from pipeline.sfm.second_look import (
-    MIN_STRONG_PAIRS,
-    STRONG_INLIERS,
-    SecondLook,
-    extract_more,
-)
+from pipeline.sfm.second_look import SecondLook, extract_more
 
 #: The colours of the keypoints, beside the database: image id -> (F, 3) uint8.
 COLORS_FILE = "keypoint_colors.npz"
@@ -125,16 +119,11 @@ def match_features(
     verified = verified_inliers(database)
     decisions = list(chosen.decisions)
     if look is not None and look.is_needed(names, verified):
-        before = len(verified)
         extract_more(scene.manifest, look, threads)
         scene = replace(scene, features=look.out)
         build_database(database, scene.inputs(chosen.focals), pairs, cache=cache, threads=threads)
-        verified = verified_inliers(database)
-        decisions.append(
-            f"many photographs had fewer than {MIN_STRONG_PAIRS} pairs with {STRONG_INLIERS} "
-            f"inliers: up to {MORE_FEATURES} features in each raise the verified pairs from "
-            f"{before} to {len(verified)}"
-        )
+        before, verified = len(verified), verified_inliers(database)
+        decisions.append(look.decision(before, len(verified)))
     _write_colors(scene.inputs(), database.with_name(COLORS_FILE))
     if not verified:
         raise UserError(

@@ -57,6 +57,15 @@ class SecondLook:
         weak = sum(count[name] < min(MIN_STRONG_PAIRS, len(names) - 1) for name in names)
         return weak > MAX_WEAK_SHARE * len(names)
 
+    @staticmethod
+    def decision(before: int, after: int) -> str:
+        """The sentence for the log, with the numbers of verified pairs before and after."""
+        return (
+            f"many photographs had fewer than {MIN_STRONG_PAIRS} pairs with {STRONG_INLIERS} "
+            f"inliers: up to {MORE_FEATURES} features in each raise the verified pairs from "
+            f"{before} to {after}"
+        )
+
 
 def extract_more(manifest: Manifest, look: SecondLook, threads: int) -> None:
     """Write the keypoint files of all photographs to ``look.out``: more features, also of lower

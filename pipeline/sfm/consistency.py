@@ -84,7 +84,7 @@ def measure_consistency(
     return Consistency(
         agreeing_matches=agreeing / max(matches, 1),
         agreeing_pairs=sum(strong_pairs_agree) / max(len(strong_pairs_agree), 1),
-        agreeing_distinctive=sum(distinctive_agree) / max(len(distinctive_agree), 1),
+        agreeing_distinctive=float(np.mean(distinctive_agree)) if distinctive_agree else 1.0,
         missing_covisibility=missing_covisibility(model, views),
     )
 

@@ -23,6 +23,9 @@ MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
 MIN_AGREEING_DISTINCTIVE = (0.94, 0.98)
 MAX_MISSING_COVISIBILITY = (0.35, 0.15)
+# The threshold of weak models if the strong and the distinctive pairs all agree: photographs far
+# apart around a thing observe few common points.
+ALL_AGREE, MAX_MISSING_COVISIBILITY_ALL_AGREE = 0.995, 0.3
 # A model that exceeds both is folded, although each alone would only be weak.
 FOLDED_AGREEING, FOLDED_MISSING_COVISIBILITY = 0.97, 0.15
 # Below this, pure rotation explains the matches up to noise (half a pixel).
@@ -188,6 +191,9 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
     folded = (
         e.agreeing_pairs < FOLDED_AGREEING and e.missing_covisibility > FOLDED_MISSING_COVISIBILITY
     )
+    most_missing = MAX_MISSING_COVISIBILITY[level]
+    if not failed and min(e.agreeing_pairs, e.agreeing_distinctive) >= ALL_AGREE:
+        most_missing = MAX_MISSING_COVISIBILITY_ALL_AGREE
     return [
         _Finding(
             share < (min_registered_share if failed else MIN_SHARE_GOOD),
@@ -218,7 +224,7 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
             _REPEATED,
         ),
         _Finding(
-            e.missing_covisibility > MAX_MISSING_COVISIBILITY[level] and not (failed and folded),
+            e.missing_covisibility > most_missing and not (failed and folded),
             f"{e.missing_covisibility:.0%} of neighbouring photographs do not see the same points: "
             "different parts that look alike may have been merged",
             _REPEATED,

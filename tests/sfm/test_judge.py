@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.runtime.isolate import run_isolated
-from pipeline.sfm.judge import Evidence, judge
+from pipeline.sfm.judge import judge
+from tests.counters import GOOD as GOOD_EVIDENCE
 
 # Fast cases; all of them: python -m benchmarks.judge.
 GOOD = ("three_views", "prior_x3.0", "duplicates")
@@ -79,28 +80,7 @@ def test_wrong_models_that_register_all_images_are_failed(case, tmp_path):
 )
 def test_signs_of_a_fold_decide(changed, expected):
     """Missing covisibility alone is weaker evidence than pairs that contradict the model."""
-    evidence = Evidence(
-        registered=20,
-        total=20,
-        reachable=20,
-        points=5000,
-        observations_per_image=500.0,
-        mean_track_length=4.0,
-        reprojection_px=0.3,
-        explained_matches=0.9,
-        agreeing_matches=1.0,
-        agreeing_pairs=1.0,
-        agreeing_distinctive=1.0,
-        missing_covisibility=0.0,
-        broken_steps=0,
-        behind_camera=0.0,
-        parallax=0.05,
-        median_angle_deg=10.0,
-        focal_off=1.0,
-        focal_certainty=None,
-        focal_relative=0.8,
-    )
-    assert judge(evidence.model_copy(update=changed), 0.5).grade == expected
+    assert judge(GOOD_EVIDENCE.model_copy(update=changed), 0.5).grade == expected
 
 
 def test_the_benchmark_aligns_a_model_by_the_majority_of_its_views():

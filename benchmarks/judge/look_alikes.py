@@ -130,7 +130,7 @@ def _dome(rng: np.random.Generator) -> World:
     return World((drum, dome, *_surroundings(rng, 1.3, 5.0)))
 
 
-def _street(rng: np.random.Generator) -> World:
+def _facades(rng: np.random.Generator) -> World:
     """Equal facades along x; the pavement and the objects in front of them differ."""
     wall, lengths = _material(rng, 0.06, 0.8), 12.0
     facade = Body(Box((0.0, 2.0, 1.5), (lengths, 0.3, 1.5)), wall, period=1.5)
@@ -151,11 +151,11 @@ def _world(name: str, seed: int) -> World:
     if name.startswith("box"):
         half = (0.8, 0.45, 0.7) if name == "box_2" else (0.6, 0.6, 0.8)
         return _box(rng, half, int(name[-1]))
-    made = {"temple": _temple, "courtyard": _courtyard, "dome": _dome, "street": _street}
+    made = {"temple": _temple, "courtyard": _courtyard, "dome": _dome, "facades": _facades}
     return made[name](rng)
 
 
-WORLDS = ("can_2", "can_3", "box_2", "box_4", "temple", "courtyard", "dome", "street")
+WORLDS = ("can_2", "can_3", "box_2", "box_4", "temple", "courtyard", "dome", "facades")
 LOOK_ALIKES = tuple(f"{world}{kind}" for world in WORLDS for kind in ("", "_video"))
 
 

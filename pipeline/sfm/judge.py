@@ -21,7 +21,7 @@ Grade = Literal["good", "weak", "failed"]
 MIN_EXPLAINED = (0.20, 0.40)
 MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
-MIN_AGREEING_DISTINCTIVE = (0.94, 0.98)
+MIN_AGREEING_DISTINCTIVE = (0.96, 0.98)
 MAX_MISSING_COVISIBILITY = (0.35, 0.15)
 # The threshold of weak models if the strong and the distinctive pairs all agree: photographs far
 # apart around a thing observe few common points.

@@ -74,7 +74,7 @@ def test_wrong_models_that_register_all_images_are_failed(case, tmp_path):
         ({"missing_covisibility": 0.32}, "weak"),
         ({"missing_covisibility": 0.36}, "failed"),
         ({"agreeing_distinctive": 0.97}, "weak"),
-        ({"agreeing_distinctive": 0.93}, "failed"),
+        ({"agreeing_distinctive": 0.95}, "failed"),
         ({"broken_steps": 1}, "failed"),
     ],
 )

@@ -46,7 +46,8 @@ def broken_steps(
     """The steps at which a model turns the camera far more than the sequence does.
 
     A step is broken if most of the verified pairs across it contradict the turn: without pairs it
-    is a cut, and with pairs that agree the camera turned. A single stray photograph breaks no step.
+    is a cut, and with pairs that agree the camera turned. A single stray photograph breaks no step,
+    nor does one at an end of the sequence.
 
     Args:
         rotations: Name -> (3, 3) world to camera, of the registered photographs.
@@ -69,7 +70,9 @@ def broken_steps(
         return found
 
     def is_broken(a: str, b: str) -> bool:
-        outer = _turn(rotations[before.get(a, a)], rotations[after.get(b, b)])
+        if a not in before or b not in after:
+            return False
+        outer = _turn(rotations[before[a]], rotations[after[b]])
         firsts, seconds = around(a, before), around(b, after)
         across = [agrees((x, y)) for x in firsts for y in seconds]
         return outer > limit and across.count(True) < across.count(False)

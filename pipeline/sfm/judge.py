@@ -92,7 +92,7 @@ class Evidence(BaseModel):
     )
     broken_steps: int = Field(
         description="Number of steps between neighbours of a sequence at which the model turns the "
-        "camera far more than the sequence does, although verified pairs connect both sides."
+        "camera far more than the sequence does, and most verified pairs across it contradict that."
     )
     missing_covisibility: float = Field(
         description="Share of neighbouring images that should observe many common points and "
@@ -250,8 +250,8 @@ def _failures(e: Evidence) -> list[_Finding]:
         ),
         _Finding(
             e.broken_steps > 0,
-            f"the camera turns abruptly at {e.broken_steps} step(s) of a sequence whose "
-            "photographs overlap: different parts that look alike may have been merged",
+            f"the camera turns abruptly at {e.broken_steps} step(s) of a sequence, which the "
+            "pairs across them contradict: different parts that look alike may have been merged",
             _REPEATED,
         ),
         _Finding(

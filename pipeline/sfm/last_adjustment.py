@@ -2,7 +2,7 @@
 
 Residuals of SIFT keypoints have heavy tails: those of large scales and at edges of occlusion are
 several times less accurate than the others. A Cauchy loss of the scale of the median residual gives
-them little weight, and halves the errors of the poses against one pixel.
+them little weight.
 """
 
 from __future__ import annotations

@@ -56,6 +56,7 @@ def test_sequences_are_frames_of_one_video():
         ((0, 10, 20, 200, 210), None, 0),  # A cut.
         ((0, 10, 20, 200, 210), True, 0),  # The camera turned.
         ((0, 10, 200, 30, 40), False, 0),  # One stray photograph.
+        ((0, 10, 20, 30, 200), False, 0),  # A stray photograph at the end.
         ((0, 60, 120, 180, 240), False, 0),  # Photographs far apart, evenly.
     ],
 )

@@ -117,7 +117,7 @@ class Capture:
                 )
             grown = grown and bool(others)
         if main is not given and main.alone.grade == "good":
-            model, last = adjust_last(main.model, cameras=False)
+            model, last = adjust_last(main.model, self.database, cameras=False)
             main = self.judged(model)
             decisions.append(last)
         return main, list(others), decisions

@@ -1,36 +1,50 @@
-"""The last bundle adjustment, by the keypoints that fit best.
+"""The last bundle adjustment, by the tracks and keypoints that fit best.
 
 Residuals of SIFT keypoints have heavy tails: those of large scales and at edges of occlusion are
-several times less accurate than the others. A Cauchy loss of the scale of the median residual gives
-them little weight.
+several times less accurate than the others, often in all photographs of a track. A Cauchy loss of
+the scale of the median residual gives such keypoints little weight, and tracks with large residuals
+have no influence on the poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Set
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from pipeline.sfm.refine import EXACT_PX, bundle_adjust
+from pipeline.sfm.refine import EXACT_PX, adjust_points, bundle_adjust
 
 #: Observations with a larger reprojection error, and those behind their camera, are removed
 #: (COLMAP: ``filter_max_reproj_error``).
 MAX_REPROJECTION_PX = 4.0
 #: Bounds of the scale of the loss, pixels: keypoints are hardly more accurate than the first.
 LOSS_PX = (0.05, 1.0)
+#: Tracks are completed and merged with so many times the median residual, and this at least, as the
+#: largest reprojection error, pixels.
+TRIANGULATION_RESIDUALS, MIN_TRIANGULATION_PX = 5.0, 1.0
+#: Smallest angle at which points are triangulated, degrees.
+MIN_ANGLE_DEG = 0.5
+#: Tracks with an RMS residual of more than so many times the median one do not move the cameras.
+RELIABLE_RESIDUALS = 4.0
 
 
 def adjust_last(
     model: pycolmap.Reconstruction,
+    database: Path,
     free_principal_points: Set[int] = frozenset(),
     *,
     cameras: bool = True,
 ) -> tuple[pycolmap.Reconstruction, str]:
-    """Remove gross outliers and adjust poses, points and cameras with a narrow robust loss.
+    """Remove gross outliers, make tracks longer and adjust poses, points and cameras with a narrow
+    robust loss. Runs on one thread.
 
     Args:
         model: An adjusted model, which is not changed.
+        database: The database that the model was mapped from; not changed.
         free_principal_points: The ids of the cameras whose principal points are refined.
         cameras: Whether focal lengths and distortions are refined.
 
@@ -38,14 +52,101 @@ def adjust_last(
         The model and a sentence for the log.
     """
     adjusted = pycolmap.Reconstruction(model)
-    removed = pycolmap.ObservationManager(adjusted).filter_all_points3D(MAX_REPROJECTION_PX, 0.0)
-    adjusted.update_point_3d_errors()
-    errors = [point.error for point in adjusted.points3D.values()]
-    error = float(np.median(errors)) if errors else 0.0
-    if error < EXACT_PX:
+    removed = _remove_outliers(adjusted)
+    if _median_error(adjusted) < EXACT_PX:
         return adjusted, f"{removed} outliers removed; the other tracks fit exactly"
-    loss = float(np.clip(error, *LOSS_PX))
-    bundle_adjust(adjusted, free_principal_points, focal=cameras, distortion=cameras, loss_px=loss)
+    adjust = partial(bundle_adjust, adjusted, free_principal_points, focal=cameras)
+    adjust(distortion=cameras, loss_px=_loss(adjusted))
+    removed += _remove_outliers(adjusted)
+    _triangulate(adjusted, database)
+    held = _take_unreliable(adjusted)
+    loss = _loss(adjusted)
+    adjust(distortion=cameras, loss_px=loss)
+    reliable = set(adjusted.point3D_ids())
+    for xyz, track in held:
+        adjusted.add_point3D(xyz, track)
+    adjust_points(adjusted, loss_px=loss, done=reliable)
+    removed += _remove_outliers(adjusted)
     return adjusted, (
-        f"last bundle adjustment with a Cauchy loss of {loss:.2f} px, {removed} outliers removed"
+        f"last bundle adjustment with a Cauchy loss of {loss:.2f} px by {len(reliable)} tracks; "
+        f"{len(held)} less accurate ones follow, {removed} outliers removed"
     )
+
+
+def _loss(model: pycolmap.Reconstruction) -> float:
+    """The scale of the loss, pixels."""
+    return float(np.clip(_median_error(model), *LOSS_PX))
+
+
+def _median_error(model: pycolmap.Reconstruction) -> float:
+    """The median of the points' mean reprojection errors, pixels."""
+    errors = [point.error for point in model.points3D.values()]
+    return float(np.median(errors)) if errors else 0.0
+
+
+def _remove_outliers(model: pycolmap.Reconstruction) -> int:
+    removed = pycolmap.ObservationManager(model).filter_all_points3D(MAX_REPROJECTION_PX, 0.0)
+    model.update_point_3d_errors()
+    return int(removed)
+
+
+def _triangulate(model: pycolmap.Reconstruction, database: Path) -> None:
+    """Triangulate, complete and merge tracks by the verified matches, in place."""
+    max_error_px = max(TRIANGULATION_RESIDUALS * _median_error(model), MIN_TRIANGULATION_PX)
+    with pycolmap.Database.open(database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    graph = cache.correspondence_graph
+    manager = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, manager)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    options.random_seed = 0
+    options.ignore_two_view_tracks = False
+    options.min_angle = MIN_ANGLE_DEG
+    options.merge_max_reproj_error = options.complete_max_reproj_error = max_error_px
+    options.create_max_angle_error = options.continue_max_angle_error = MIN_ANGLE_DEG
+    for image_id in sorted(model.reg_image_ids()):
+        triangulator.triangulate_image(options, image_id)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    manager.filter_all_points3D(max_error_px, MIN_ANGLE_DEG)
+    model.update_point_3d_errors()
+
+
+def _take_unreliable(
+    model: pycolmap.Reconstruction,
+) -> list[tuple[NDArray[np.float64], pycolmap.Track]]:
+    """Remove the tracks with large residuals from a model and return them."""
+    ids = np.array(sorted(model.point3D_ids()))
+    of_point, residuals = _residuals(model, ids)
+    length = np.bincount(of_point, minlength=len(ids))
+    squares = np.bincount(of_point, weights=residuals**2, minlength=len(ids))
+    # A track of n keypoints has 2 n - 3 degrees of freedom.
+    rms = np.sqrt(squares / np.maximum(length - 1.5, 0.5))
+    manager = pycolmap.ObservationManager(model)
+    held = []
+    for point_id in ids[rms > RELIABLE_RESIDUALS * np.median(residuals)]:
+        point = model.point3D(int(point_id))
+        elements = [pycolmap.TrackElement(e.image_id, e.point2D_idx) for e in point.track.elements]
+        held.append((point.xyz.copy(), pycolmap.Track(elements)))
+        manager.delete_point3D(int(point_id))
+    return held
+
+
+def _residuals(
+    model: pycolmap.Reconstruction, ids: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """For each observation the index of its point in sorted ``ids``, and the reprojection error in
+    pixels; (N,) each."""
+    xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
+    of_point, residuals = [], []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        index = np.searchsorted(ids, [point.point3D_id for point in seen])
+        local = image.cam_from_world() * xyz[index]
+        projected = np.asarray(model.camera(image.camera_id).img_from_cam(local)).reshape(-1, 2)
+        of_point.append(index)
+        residuals.append(np.linalg.norm(projected - [point.xy for point in seen], axis=1))
+    return np.concatenate(of_point), np.concatenate(residuals)

@@ -148,7 +148,7 @@ def _refined(
     alone = component.alone.grade
     if alone == "good" or config.refine_principal_point == "yes":
         refined = refine(component.model, principal_point=config.refine_principal_point)
-        model, last = adjust_last(refined.model, refined.free_principal_points)
+        model, last = adjust_last(refined.model, capture.database, refined.free_principal_points)
         decisions = [*refined.decisions, last]
     else:
         refined = refine_weak(component.model, focal_priors(capture.database))

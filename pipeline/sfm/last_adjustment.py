@@ -29,7 +29,7 @@ TRIANGULATION_RESIDUALS, MIN_TRIANGULATION_PX = 5.0, 1.0
 #: Smallest angle at which points are triangulated, degrees.
 MIN_ANGLE_DEG = 0.5
 #: Tracks with an RMS residual of more than so many times the median one do not move the cameras.
-RELIABLE_RESIDUALS = 4.0
+RELIABLE_RESIDUALS = 5.0
 
 
 def adjust_last(

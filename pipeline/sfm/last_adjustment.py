@@ -23,6 +23,8 @@ from pipeline.sfm.refine import EXACT_PX, adjust_points, bundle_adjust
 MAX_REPROJECTION_PX = 4.0
 #: Bounds of the scale of the loss, pixels: keypoints are hardly more accurate than the first.
 LOSS_PX = (0.05, 1.0)
+#: Tracks are made longer and the model adjusted until this share of new tracks or fewer is found.
+SETTLED, MAX_ROUNDS = 0.05, 3
 #: Tracks are completed and merged with so many times the median residual, and this at least, as the
 #: largest reprojection error, pixels.
 TRIANGULATION_RESIDUALS, MIN_TRIANGULATION_PX = 5.0, 1.0
@@ -57,15 +59,20 @@ def adjust_last(
         return adjusted, f"{removed} outliers removed; the other tracks fit exactly"
     adjust = partial(bundle_adjust, adjusted, free_principal_points, focal=cameras)
     adjust(distortion=cameras, loss_px=_loss(adjusted))
-    removed += _remove_outliers(adjusted)
-    _triangulate(adjusted, database)
-    held = _take_unreliable(adjusted)
-    loss = _loss(adjusted)
-    adjust(distortion=cameras, loss_px=loss)
-    reliable = set(adjusted.point3D_ids())
-    for xyz, track in held:
-        adjusted.add_point3D(xyz, track)
-    adjust_points(adjusted, loss_px=loss, done=reliable)
+    for _ in range(MAX_ROUNDS):
+        removed += _remove_outliers(adjusted)
+        before = adjusted.num_points3D()
+        _triangulate(adjusted, database)
+        has_settled = adjusted.num_points3D() < (1 + SETTLED) * before
+        held = _take_unreliable(adjusted)
+        loss = _loss(adjusted)
+        adjust(distortion=cameras, loss_px=loss)
+        reliable = set(adjusted.point3D_ids())
+        for xyz, track in held:
+            adjusted.add_point3D(xyz, track)
+        adjust_points(adjusted, loss_px=loss, done=reliable)
+        if has_settled:
+            break
     removed += _remove_outliers(adjusted)
     return adjusted, (
         f"last bundle adjustment with a Cauchy loss of {loss:.2f} px by {len(reliable)} tracks; "

@@ -1,5 +1,5 @@
 """Camera poses and sparse points. Outputs: ``sparse/0`` (a COLMAP model), ``georeference.json``
-(its frame) and ``other_models`` if there are any."""
+(its frame), ``uncertainty.json`` and ``other_models`` if there are any."""
 
 from __future__ import annotations
 

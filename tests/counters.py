@@ -4,6 +4,7 @@ from pipeline.photos.counters import InspectCounters
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, RefineCounters, SfmCounters
 from pipeline.sfm.judge import Evidence
+from pipeline.sfm.uncertainty_file import UncertaintySummary
 from pipeline.training.loop.counters import ChangeCounters, TrainCounters
 
 GOOD = Evidence(
@@ -47,8 +48,10 @@ SFM = SfmCounters(
             params=[600.0, 320.0, 240.0, 0.01],
             num_images=6,
             focal_prior_px=None,
+            focal_uncertainty_percent=0.1,
         )
     ],
+    uncertainty=UncertaintySummary(median=0.001, largest=0.002, direction_deg=0.01, uncertain=[]),
     verdict="good",
     evidence=GOOD,
     attempts=[

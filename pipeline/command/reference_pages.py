@@ -37,6 +37,7 @@ _FILES = {
     "evaluation": "evaluation.json",
     "coverage": "coverage.json",
     "georeference": "georeference.json",
+    "uncertainty": "uncertainty.json",
     "frame": "frame.json",
     "path": "path.json",
     "stage": "stage.json",

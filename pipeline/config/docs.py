@@ -40,6 +40,7 @@ _RECORDS = {
     "evaluation.json": "pipeline.metrics.evaluation:Evaluation",
     "coverage.json": "pipeline.coverage.record:CoverageRecord",
     "georeference.json": "pipeline.scene.georeference:Georeference",
+    "uncertainty.json": "pipeline.sfm.uncertainty_file:Uncertainty",
     "frame.json": "pipeline.io.frame_json:Frame",
     "path.json": "pipeline.surface.path:PathFile",
     "partition.json": "pipeline.scene.blocks:Partition",

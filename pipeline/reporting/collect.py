@@ -61,6 +61,7 @@ def collect_metrics(
             "total_images": inspect.photos + inspect.left_out + frames,
             "reprojection_error_px": sfm.mean_reprojection_error_px if sfm else error_px,
             "sfm_verdict": sfm.verdict if sfm else None,
+            "pose_uncertainty": sfm.uncertainty if sfm else None,
             "georeference": sfm.georeference if sfm else None,
             "components": sfm.components if sfm else [],
             "gaps": sfm.gaps if sfm else [],

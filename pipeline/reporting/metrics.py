@@ -17,6 +17,7 @@ from pipeline.runtime.json_file import JsonFile, JsonObject
 from pipeline.runtime.record import RunRecord, read_run
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.counters import ComponentSummary, Gap
+from pipeline.sfm.uncertainty_file import UncertaintySummary
 
 
 class StageStatus(JsonObject):
@@ -46,6 +47,9 @@ class Metrics(JsonFile, SceneQuality):
         description="Mean over the sparse points; null if no stage computed it."
     )
     sfm_verdict: str | None = Field(description="good, weak or failed; null for given poses.")
+    pose_uncertainty: UncertaintySummary | None = Field(
+        None, description="Standard deviations of the poses, from sfm; null for given poses."
+    )
     georeference: GeoreferenceSummary | None = Field(
         description="The world's frame, from sfm; null for given poses."
     )

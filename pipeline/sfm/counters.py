@@ -11,6 +11,7 @@ from pipeline.runtime.counters import StageCounters
 from pipeline.runtime.text import counted
 from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.judge import Evidence, Grade
+from pipeline.sfm.uncertainty_file import UncertaintySummary
 
 Mapper = Literal["incremental", "global"]
 
@@ -79,6 +80,10 @@ class CameraSummary(BaseModel):
     num_images: int = Field(description="Number of registered images.")
     focal_prior_px: float | None = Field(
         description="Focal length from EXIF, pixels; null where it is unknown."
+    )
+    focal_uncertainty_percent: float | None = Field(
+        description="Standard deviation of the focal length, per cent; null for panoramas and "
+        "where `uncertainty` is."
     )
 
 
@@ -151,6 +156,10 @@ class SfmCounters(StageCounters):
         "pose to the model that is used."
     )
     cameras: list[CameraSummary] = Field(description="The model's cameras.")
+    uncertainty: UncertaintySummary | None = Field(
+        description="Standard deviations of the poses; `uncertainty.json` has those of each "
+        "photograph. null for more than 1000 photographs."
+    )
     verdict: Grade = Field(description="Quality of the model; a failed one ends the stage.")
     evidence: Evidence = Field(description="The statistics behind the verdict.")
     attempts: list[AttemptRecord] = Field(description="The mapping attempts, in order.")

@@ -16,13 +16,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipeline.sfm.keypoint_variance import RELIABLE_RESIDUALS, loss_scale, median_error
 from pipeline.sfm.refine import EXACT_PX, adjust_points, bundle_adjust
 
 #: Observations with a larger reprojection error, and those behind their camera, are removed
 #: (COLMAP: ``filter_max_reproj_error``).
 MAX_REPROJECTION_PX = 4.0
-#: Bounds of the scale of the loss, pixels: keypoints are hardly more accurate than the first.
-LOSS_PX = (0.05, 1.0)
 #: Tracks are made longer and the model adjusted until this share of new tracks or fewer is found.
 SETTLED, MAX_ROUNDS = 0.05, 3
 #: Tracks are completed and merged with so many times the median residual, and this at least, as the
@@ -30,8 +29,6 @@ SETTLED, MAX_ROUNDS = 0.05, 3
 TRIANGULATION_RESIDUALS, MIN_TRIANGULATION_PX = 5.0, 1.0
 #: Smallest angle at which points are triangulated, degrees.
 MIN_ANGLE_DEG = 0.5
-#: Tracks with an RMS residual of more than so many times the median one do not move the cameras.
-RELIABLE_RESIDUALS = 5.0
 
 
 def adjust_last(
@@ -55,17 +52,17 @@ def adjust_last(
     """
     adjusted = pycolmap.Reconstruction(model)
     removed = _remove_outliers(adjusted)
-    if _median_error(adjusted) < EXACT_PX:
+    if median_error(adjusted) < EXACT_PX:
         return adjusted, f"{removed} outliers removed; the other tracks fit exactly"
     adjust = partial(bundle_adjust, adjusted, free_principal_points, focal=cameras)
-    adjust(distortion=cameras, loss_px=_loss(adjusted))
+    adjust(distortion=cameras, loss_px=loss_scale(adjusted))
     for _ in range(MAX_ROUNDS):
         removed += _remove_outliers(adjusted)
         before = adjusted.num_points3D()
         _triangulate(adjusted, database)
         has_settled = adjusted.num_points3D() < (1 + SETTLED) * before
         held = _take_unreliable(adjusted)
-        loss = _loss(adjusted)
+        loss = loss_scale(adjusted)
         adjust(distortion=cameras, loss_px=loss)
         reliable = set(adjusted.point3D_ids())
         for xyz, track in held:
@@ -80,17 +77,6 @@ def adjust_last(
     )
 
 
-def _loss(model: pycolmap.Reconstruction) -> float:
-    """The scale of the loss, pixels."""
-    return float(np.clip(_median_error(model), *LOSS_PX))
-
-
-def _median_error(model: pycolmap.Reconstruction) -> float:
-    """The median of the points' mean reprojection errors, pixels."""
-    errors = [point.error for point in model.points3D.values()]
-    return float(np.median(errors)) if errors else 0.0
-
-
 def _remove_outliers(model: pycolmap.Reconstruction) -> int:
     removed = pycolmap.ObservationManager(model).filter_all_points3D(MAX_REPROJECTION_PX, 0.0)
     model.update_point_3d_errors()
@@ -99,7 +85,7 @@ def _remove_outliers(model: pycolmap.Reconstruction) -> int:
 
 def _triangulate(model: pycolmap.Reconstruction, database: Path) -> None:
     """Triangulate, complete and merge tracks by the verified matches, in place."""
-    max_error_px = max(TRIANGULATION_RESIDUALS * _median_error(model), MIN_TRIANGULATION_PX)
+    max_error_px = max(TRIANGULATION_RESIDUALS * median_error(model), MIN_TRIANGULATION_PX)
     with pycolmap.Database.open(database) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
     graph = cache.correspondence_graph

@@ -34,6 +34,9 @@ from pipeline.sfm.last_adjustment import adjust_last
 from pipeline.sfm.matching import COLORS_FILE, list_names
 from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
 from pipeline.sfm.refine import refine
+from pipeline.sfm.uncertain import MAX_BASELINE_SHARE, with_uncertainty
+from pipeline.sfm.uncertainty import estimate_uncertainty
+from pipeline.sfm.uncertainty_file import Uncertainty
 from pipeline.sfm.weak import refine_weak
 
 USED_FOLDER = "sparse/0"
@@ -49,18 +52,22 @@ class MappedScene:
         report: The counters and messages of the stage.
         models: The models by their folders, with coloured points.
         georeference: The world frame of the model that is used.
+        uncertainty: That of its poses; None if it is not computed.
     """
 
     report: Report[SfmCounters]
     models: dict[str, pycolmap.Reconstruction]
     georeference: Georeference
+    uncertainty: Uncertainty | None
 
     def write(self, out: Path) -> None:
-        """Write the model to ``out/sparse/0``, the other components to ``out/other_models/<n>`` and
-        the world frame to ``out/georeference.json``."""
+        """Write the model to ``out/sparse/0``, the other components to ``out/other_models/<n>``,
+        the world frame to ``out/georeference.json`` and ``out/uncertainty.json``."""
         for folder, model in self.models.items():
             write_model(model, out / folder)
         self.georeference.write(out)
+        if self.uncertainty:
+            self.uncertainty.write(out)
 
 
 def reconstruct(
@@ -102,9 +109,12 @@ def reconstruct(
             raise _failure(chosen or attempt, attempts, components)
         components[config.component] = chosen
         gaps = find_gaps(capture.database, components, config.component)
-        cameras = _camera_summaries(chosen.model, focal_priors(capture.database))
+        priors = focal_priors(capture.database)
     model = chosen.model
     frame = align_model(model, manifest, config.georeference, ground_control)
+    uncertainty = estimate_uncertainty(model, priors)
+    pose_uncertainty = uncertainty.summary(MAX_BASELINE_SHARE) if uncertainty else None
+    verdict, doubts = with_uncertainty(chosen.verdict, pose_uncertainty, len(chosen.photographs))
     if colors := _read_colors(database.with_name(COLORS_FILE)):
         for component in components:
             color_points(component.model, colors)
@@ -123,17 +133,19 @@ def reconstruct(
             for index, component in enumerate(components)
         ],
         gaps=gaps,
-        cameras=cameras,
-        verdict=chosen.verdict.grade,
+        cameras=_camera_summaries(model, priors, uncertainty),
+        uncertainty=pose_uncertainty,
+        verdict=verdict.grade,
         evidence=chosen.evidence,
         attempts=attempts,
         georeference=georeference.summary(),
     )
-    warnings += [*frame.warnings, *_warnings(counters, chosen.verdict, config.component)]
+    warnings += [*frame.warnings, *doubts, *_warnings(counters, verdict, config.component)]
     return MappedScene(
         Report(counters, decisions + frame.decisions, warnings),
         {_folder(i, config.component): each.model for i, each in enumerate(components)},
         georeference,
+        uncertainty,
     )
 
 
@@ -268,9 +280,10 @@ def _read_colors(path: Path) -> Colors:
 
 
 def _camera_summaries(
-    model: pycolmap.Reconstruction, priors: Mapping[int, float]
+    model: pycolmap.Reconstruction, priors: Mapping[int, float], uncertainty: Uncertainty | None
 ) -> list[CameraSummary]:
     """The cameras of registered images; ``priors``: camera id -> focal length from EXIF, pixels."""
+    focal = uncertainty.focal_percent if uncertainty else {}
     count = Counter(model.image(image_id).camera_id for image_id in model.reg_image_ids())
     return [
         CameraSummary(
@@ -281,6 +294,7 @@ def _camera_summaries(
             params=[float(value) for value in camera.params],
             num_images=count[camera_id],
             focal_prior_px=priors.get(camera_id),
+            focal_uncertainty_percent=focal.get(camera_id),
         )
         for camera_id, camera in sorted(model.cameras.items())
         if camera_id in count

@@ -11,13 +11,8 @@ import numpy as np
 import pycolmap
 
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
+from pipeline.sfm.freed_parameters import free_parameters
 
-# Smallest relative decrease of the robust cost for which a freed parameter is accepted. Parameters
-# that the camera has lower the cost by at least 0.5%, others by at most 0.1%.
-MIN_GAIN = 0.004
-# Largest accepted shift of the principal point over the longer side: lenses are centred to a few
-# per cent of the image, and a larger shift compensates for other errors.
-MAX_SHIFT = 0.06
 # Below this RMS reprojection error the observations are projections by these cameras (synthetic).
 EXACT_PX = 0.01
 EXACT = "the tracks fit exactly: nothing is refined"
@@ -48,7 +43,8 @@ def refine(
     inner_iterations: bool = False,
 ) -> Refined:
     """Robust bundle adjustment of a whole model, then of more camera parameters: a second radial
-    distortion term, then the principal point. A parameter is accepted if it lowers the cost enough.
+    distortion term, then the principal point. They are accepted for each camera by itself, if they
+    lower the cost of its observations enough.
 
     Only cameras with enough images are freed.
 
@@ -62,13 +58,12 @@ def refine(
     shared = {i for i in adjustable if images[i] >= MIN_IMAGES_PER_CAMERA}
     best = pycolmap.Reconstruction(model)
     cost = bundle_adjust(best, inner_iterations=inner_iterations)
-    unchanged = None
     # Ceres' cost is half of the sum of squares.
-    if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
-        unchanged = EXACT
-    elif not adjustable:
+    is_exact = np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX
+    unchanged = EXACT if is_exact else None
+    if not is_exact and not adjustable:
         unchanged = "panoramas have no intrinsics to refine"
-    elif not shared and principal_point != "yes":
+    elif not is_exact and not shared and principal_point != "yes":
         unchanged = (
             f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and principal "
             "points are unchanged"
@@ -76,32 +71,37 @@ def refine(
     if unchanged is not None:
         return Refined(best, False, set(), [unchanged])
     shared = shared or adjustable
+
+    def with_radial(trial: pycolmap.Reconstruction, cameras: Set[int]) -> float:
+        for camera_id in cameras:
+            _make_radial(trial.camera(camera_id))
+        return bundle_adjust(trial, inner_iterations=inner_iterations)
+
+    def with_principal_points(trial: pycolmap.Reconstruction, cameras: Set[int]) -> float:
+        return bundle_adjust(trial, cameras, inner_iterations=inner_iterations)
+
     decisions: list[str] = []
     freed, free_principal_points = False, set[int]()
-    if any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
-        freer = pycolmap.Reconstruction(best)
-        for camera_id in shared:
-            _make_radial(freer.camera(camera_id))
-        freer_cost = bundle_adjust(freer, inner_iterations=inner_iterations)
-        gain = 1 - freer_cost / max(cost, 1e-12)
-        accepted = gain >= MIN_GAIN
+    simple = {i for i in shared if model.camera(i).model_name == "SIMPLE_RADIAL"}
+    if simple:
+        trial = free_parameters(best, cost, simple, with_radial)
         decisions.append(
-            f"camera model {'RADIAL' if accepted else 'SIMPLE_RADIAL'}: a second radial term "
-            f"lowers the cost by {gain:.2%}"
+            f"camera model {'RADIAL' if trial.accepted else 'SIMPLE_RADIAL'}{trial.which}: a "
+            f"second radial term lowers the cost by {trial.gain:.2%}"
         )
-        if accepted:
-            best, cost, freed = freer, freer_cost, True
+        if trial.accepted:
+            best, cost, freed = trial.model, trial.cost, True
     if principal_point != "no":
-        freer = pycolmap.Reconstruction(best)
-        freer_cost = bundle_adjust(freer, shared, inner_iterations=inner_iterations)
-        gain, shift = 1 - freer_cost / max(cost, 1e-12), _largest_shift(best, freer, shared)
-        accepted = principal_point == "yes" or (gain >= MIN_GAIN and shift <= MAX_SHIFT)
-        decisions.append(
-            f"principal point {'refined' if accepted else 'fixed'}: refining it lowers the cost by "
-            f"{gain:.2%} and moves it by {shift:.1%} of the longer side"
+        trial = free_parameters(
+            best, cost, shared, with_principal_points, always=principal_point == "yes"
         )
-        if accepted:
-            best, freed, free_principal_points = freer, True, shared
+        decisions.append(
+            f"principal point {'refined' if trial.accepted else 'fixed'}{trial.which}: refining it "
+            f"lowers the cost by {trial.gain:.2%} and moves it by {trial.shift:.1%} of the longer "
+            "side"
+        )
+        if trial.accepted:
+            best, freed, free_principal_points = trial.model, True, trial.accepted
     return Refined(best, freed, free_principal_points, decisions)
 
 
@@ -222,18 +222,3 @@ def _make_radial(camera: pycolmap.Camera) -> None:
         focal, cx, cy, k = camera.params
         camera.model = pycolmap.CameraModelId.RADIAL
         camera.params = [focal, cx, cy, k, 0.0]
-
-
-def _largest_shift(
-    fixed: pycolmap.Reconstruction, refined: pycolmap.Reconstruction, cameras: set[int]
-) -> float:
-    """Largest shift of a principal point, over the longer side."""
-    shifts = []
-    for camera_id in cameras:
-        before, after = fixed.camera(camera_id), refined.camera(camera_id)
-        move = np.hypot(
-            after.principal_point_x - before.principal_point_x,
-            after.principal_point_y - before.principal_point_y,
-        )
-        shifts.append(move / max(before.width, before.height))
-    return float(max(shifts))

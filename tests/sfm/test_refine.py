@@ -182,3 +182,29 @@ def _is_unique(sparse: Path) -> bool:
     from pipeline.sfm.refine import _block_order_is_unique
 
     return _block_order_is_unique(pycolmap.Reconstruction(sparse))
+
+
+def test_each_camera_is_freed_by_its_own_observations(tmp_path):
+    """A few photographs of a camera with an offset principal point among many of a central one."""
+    central, off = truth(np.zeros(2), 0.3), truth(OFF, 0.3)
+    own = [number for number in central.images if number % 3 == 0]
+    assert central.points is not None and off.points is not None
+    # ``truth`` lists the observations of each point in the order of the images.
+    xy = central.points.track_xy.copy()
+    from_off = np.isin(central.points.track_image_id, own)
+    xy[from_off] = off.points.track_xy[from_off]
+    images = {
+        number: replace(image, camera_id=2 if number in own else 1)
+        for number, image in central.images.items()
+    }
+    camera = central.cameras[1]
+    given = replace(
+        central,
+        cameras={1: camera, 2: camera},
+        images=images,
+        points=replace(central.points, track_xy=xy),
+    )
+    report, model = refined(given, tmp_path)
+    assert "of 1 of 2 cameras" in " ".join(report.decisions)
+    np.testing.assert_allclose(model.cameras[2].pinhole[2:], off.cameras[1].pinhole[2:], atol=0.7)
+    np.testing.assert_array_equal(model.cameras[1].pinhole[2:], camera.pinhole[2:])

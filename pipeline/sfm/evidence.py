@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.sfm.consistency import measure_consistency, pair_agrees
 from pipeline.sfm.continuity import Names, broken_steps
 from pipeline.sfm.distinctive import distinctive_pairs
-from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
+from pipeline.sfm.judge import FOCAL_STEP, MAX_FOCAL_OFF, Evidence
 from pipeline.sfm.model_views import Floats, ModelView, Pairs, read_views
 
 # Size of the sample of pairs, and of matches of each, that pure rotation is fitted to.
@@ -27,13 +27,16 @@ PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 14))
 PARALLAX_STEP = float(np.log(PARALLAX_FOCALS[1] / PARALLAX_FOCALS[0]))
 PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
-# Focal certainty: factor by which focal lengths are changed, number of images (evenly spread) and
-# of iterations of the bundle adjustments.
-FOCAL_STEP, FOCAL_IMAGES, FOCAL_ITERATIONS = 1.2, 30, 8
+# Focal certainty: number of images (evenly spread) and of iterations of the bundle adjustments.
+FOCAL_IMAGES, FOCAL_ITERATIONS = 30, 8
 
 
 def collect_evidence(
-    model: pycolmap.Reconstruction, database: Path, total: int, steps: Sequence[Names] = ()
+    model: pycolmap.Reconstruction,
+    database: Path,
+    total: int,
+    steps: Sequence[Names] = (),
+    original: Path | None = None,
 ) -> Evidence:
     """Compute the statistics of ``model``.
 
@@ -41,14 +44,18 @@ def collect_evidence(
         database: The database that the model was mapped from.
         total: The number of photographs of the scene.
         steps: The result of ``sequence_steps``.
+        original: The database of all pairs, which determines the distinctive ones, if pairs were
+            left out of ``database``.
     """
+    with pycolmap.Database.open(original or database) as opened:
+        distinctive = distinctive_pairs(read_verified_pairs(opened))
     with pycolmap.Database.open(database) as opened:
         verified = read_verified_pairs(opened)
         views = read_views(model, opened)
         names = {image.image_id: image.name for image in opened.read_all_images()}
     pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
     behind, observations, angles = _geometry(model, views)
-    consistency = measure_consistency(model, views, pairs, distinctive_pairs(verified))
+    consistency = measure_consistency(model, views, pairs, distinctive)
     ids = {name: image_id for image_id, name in names.items()}
 
     def agrees(pair: Names) -> bool | None:

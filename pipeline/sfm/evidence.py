@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.sfm.consistency import measure_consistency, pair_agrees
 from pipeline.sfm.continuity import Names, broken_steps
 from pipeline.sfm.distinctive import distinctive_pairs
-from pipeline.sfm.judge import FOCAL_STEP, MAX_FOCAL_OFF, Evidence
+from pipeline.sfm.judge import FOCAL_IMAGES, FOCAL_STEP, MAX_FOCAL_OFF, Evidence
 from pipeline.sfm.model_views import Floats, ModelView, Pairs, read_views
 
 # Size of the sample of pairs, and of matches of each, that pure rotation is fitted to.
@@ -27,8 +27,8 @@ PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 14))
 PARALLAX_STEP = float(np.log(PARALLAX_FOCALS[1] / PARALLAX_FOCALS[0]))
 PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
-# Focal certainty: number of images (evenly spread) and of iterations of the bundle adjustments.
-FOCAL_IMAGES, FOCAL_ITERATIONS = 30, 8
+# Focal certainty: number of iterations of the bundle adjustments.
+FOCAL_ITERATIONS = 8
 
 
 def collect_evidence(
@@ -47,15 +47,16 @@ def collect_evidence(
         original: The database of all pairs, which determines the distinctive ones, if pairs were
             left out of ``database``.
     """
-    with pycolmap.Database.open(original or database) as opened:
-        distinctive = distinctive_pairs(read_verified_pairs(opened))
     with pycolmap.Database.open(database) as opened:
-        verified = read_verified_pairs(opened)
+        verified = every = read_verified_pairs(opened)
         views = read_views(model, opened)
         names = {image.image_id: image.name for image in opened.read_all_images()}
+    if original is not None and original != database:
+        with pycolmap.Database.open(original) as opened:
+            every = read_verified_pairs(opened)
     pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
     behind, observations, angles = _geometry(model, views)
-    consistency = measure_consistency(model, views, pairs, distinctive)
+    consistency = measure_consistency(model, views, pairs, distinctive_pairs(every))
     ids = {name: image_id for image_id, name in names.items()}
 
     def agrees(pair: Names) -> bool | None:

@@ -43,8 +43,8 @@ MAX_FOCAL_OFF = 1.3
 # If the cost rises by a smaller share for another focal length, the images do not determine which
 # one is correct (planar scenes, forward motion).
 MIN_FOCAL_CERTAINTY = 0.1
-# The factor by which focal lengths are changed for ``focal_certainty``.
-FOCAL_STEP = 1.2
+# The factor by which focal lengths are changed for ``focal_certainty``, and the number of images.
+FOCAL_STEP, FOCAL_IMAGES = 1.2, 30
 # Largest standard deviation of a focal length without EXIF, relative to it. The residuals of an
 # image count as at most so many independent ones: errors of the camera model are common to them.
 MAX_FOCAL_DEVIATION, MAX_RESIDUALS_PER_IMAGE = 0.05, 250
@@ -263,7 +263,7 @@ def _determines_focal(e: Evidence) -> bool:
     if e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY:
         return True
     free = 2 * e.observations_per_image - 3 * e.points / max(e.registered, 1)
-    residuals = min(free, MAX_RESIDUALS_PER_IMAGE) * e.registered
+    residuals = min(free, MAX_RESIDUALS_PER_IMAGE) * min(e.registered, FOCAL_IMAGES)
     steps = MAX_FOCAL_DEVIATION / (FOCAL_STEP - 1)
     return e.focal_certainty * residuals * steps**2 >= 1
 

@@ -74,15 +74,23 @@ class TrustedPairs:
             ]
 
     def connect(self) -> None:
-        """Connect groups: trust pairs between them, the most distinctive first, of those that are
-        the most distinctive ones of both their photographs and that other pairs confirm."""
+        """Connect groups: trust the most distinctive pair of two groups if other pairs confirm it.
+
+        Look-alikes confirm each other too: a group whose most distinctive pair nothing confirms is
+        not connected by others.
+        """
         grown = True
         while grown:
-            grown = False
+            grown, unclear = False, set[int]()
             for a, b in self._candidates():
-                if self._group[a] != self._group[b] and self._is_supported(a, b):
+                groups = {self._group[a], self._group[b]}
+                if len(groups) == 1 or groups & unclear:
+                    continue
+                if self._is_supported(a, b):
                     self.trust([(a, b)])
                     grown = True
+                else:
+                    unclear |= groups
 
     def _is_supported(self, a: int, b: int) -> bool:
         """Whether enough other pairs between the groups would follow from this one."""

@@ -45,7 +45,7 @@ def test_correct_models_are_good(case, tmp_path):
 @pytest.mark.parametrize("case", WEAK)
 def test_correct_but_incomplete_models_are_weak(case, tmp_path):
     row = run_isolated(judged, case, 0, tmp_path)
-    assert row["truth"] == "good" and row["verdict"] == "weak", row
+    assert row["share"] == 1 and row["truth"] == "weak" and row["verdict"] == "weak", row
 
 
 @pytest.mark.parametrize("case", FAILED)
@@ -83,6 +83,26 @@ def test_signs_of_a_fold_decide(changed, expected):
     assert judge(GOOD_EVIDENCE.model_copy(update=changed), 0.5).grade == expected
 
 
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        # A plane: the cost rises little, but by more than its noise.
+        ({"focal_off": None, "focal_certainty": 0.01}, "good"),
+        # As little, with few residuals; and almost nothing.
+        ({"focal_off": None, "focal_certainty": 0.01, "observations_per_image": 330}, "weak"),
+        ({"focal_off": None, "focal_certainty": 0.001}, "weak"),
+        # At the focal length of EXIF the cost would rise much, or little.
+        ({"focal_off": 3.0, "focal_certainty": 0.01}, "good"),
+        ({"focal_off": 1.4, "focal_certainty": 0.01}, "weak"),
+        # A camera that turned by hand, and one with a short baseline.
+        ({"parallax": 0.0025, "median_angle_deg": 8.0}, "failed"),
+        ({"parallax": 0.005, "median_angle_deg": 2.5}, "good"),
+    ],
+)
+def test_focal_lengths_and_depths_must_be_determined(changed, expected):
+    assert judge(GOOD_EVIDENCE.model_copy(update=changed), 0.5).grade == expected
+
+
 def test_the_benchmark_aligns_a_model_by_the_majority_of_its_views():
     """A part of the views is rotated by 180 degrees: a least squares alignment would be off for
     all of them."""
@@ -114,6 +134,7 @@ def test_the_benchmark_aligns_a_model_by_the_majority_of_its_views():
     moved = [(r @ turn.T, 0.2 * turn @ c + 7) for r, c in folded]
     found = grade(model(moved), [model(true)], 20)
     assert found.share == pytest.approx(0.7) and found.grade == "weak"
-    assert grade(model(moved[:14]), [model(true)], 20).grade == "good"
+    assert grade(model(moved[:14]), [model(true)], 17).grade == "good"
+    assert grade(model(moved[:14]), [model(true)], 20).grade == "weak"
     assert grade(model(moved[:9]), [model(true)], 20).grade == "failed"
     assert grade(None, [model(true)], 20).grade == "failed"

@@ -135,6 +135,9 @@ def map_until_good(
 
 
 def _spare(best: Attempt, attempts: Sequence[Attempt]) -> list[pycolmap.Reconstruction]:
+    if best.change == LOOK_ALIKES_LEFT_OUT:
+        # The others may be folded, and no pair is left that would contradict them.
+        return []
     registered = {image_id for model in best.models for image_id in model.reg_image_ids()}
     return [
         model

@@ -26,6 +26,7 @@ GOOD = Evidence(
     median_angle_deg=12.0,
     focal_off=1.05,
     focal_certainty=0.8,
+    pincushion=1.0,
     focal_relative=0.9,
 )
 INSPECT = InspectCounters(photos=7, left_out=1)

@@ -29,6 +29,11 @@ PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
 # Focal certainty: number of iterations of the bundle adjustments.
 FOCAL_ITERATIONS = 8
+HOMOGRAPHIES = (
+    pycolmap.TwoViewGeometryConfiguration.PLANAR,
+    pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+    pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+)
 
 
 def collect_evidence(
@@ -76,6 +81,7 @@ def collect_evidence(
     offs = [max(focal / prior, prior / max(focal, 1e-9)) for focal, prior in known]
     focal_off = float(np.median(offs)) if offs else None
     agrees_with_exif = focal_off is not None and focal_off <= MAX_FOCAL_OFF
+    is_unsure = not agrees_with_exif or _shows_plane(database)
     return Evidence(
         registered=len(views),
         total=total,
@@ -91,9 +97,27 @@ def collect_evidence(
         parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=None if agrees_with_exif or not relative else focal_certainty(model),
+        focal_certainty=focal_certainty(model) if is_unsure and relative else None,
+        pincushion=max((_pincushion(view) for view in flat if not view.is_wide), default=1.0),
         focal_relative=float(np.median(relative)) if relative else None,
     )
+
+
+def _shows_plane(database: Path) -> bool:
+    """Whether a homography explains most of the verified pairs."""
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    of_pairs = [g.config in HOMOGRAPHIES for g in geometries if len(g.inlier_matches) > 0]
+    return bool(of_pairs) and 2 * sum(of_pairs) > len(of_pairs)
+
+
+def _pincushion(view: ModelView) -> float:
+    """The factor by which the distortion moves the middle of the image's shorter edge outwards."""
+    camera = view.camera
+    middle = np.array([[camera.width, camera.height]]) / 2
+    edge = middle * (np.array([2, 1]) if camera.width >= camera.height else np.array([1, 2]))
+    ray = np.asarray(camera.cam_from_img(edge), np.float64)
+    return float(view.longer_side / 2 / max(np.linalg.norm(ray) * view.focal, 1e-12))
 
 
 def focal_priors(database: Path) -> dict[int, float]:

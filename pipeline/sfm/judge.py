@@ -48,6 +48,8 @@ FOCAL_STEP, FOCAL_IMAGES = 1.2, 30
 # Largest standard deviation of a focal length without EXIF, relative to it. The residuals of an
 # image count as at most so many independent ones: errors of the camera model are common to them.
 MAX_FOCAL_DEVIATION, MAX_RESIDUALS_PER_IMAGE = 0.05, 250
+# The distortion of a model whose focal length is wrong may make up for it. Tele lenses have 1.05.
+MAX_PINCUSHION = 1.3
 MIN_SHARE_GOOD = 0.8
 MAX_REPROJECTION_WEAK_PX = 2.0
 # Median triangulation angle below which the baseline is too short for reliable depths.
@@ -123,7 +125,12 @@ class Evidence(BaseModel):
     )
     focal_certainty: float | None = Field(
         description="Smallest relative increase of the bundle adjustment cost for a focal length "
-        "that is off by 20 %; null (not computed) if the focal length agrees with EXIF."
+        "that is off by 20 %; null (not computed) if the focal length agrees with EXIF and the "
+        "photographs do not show a plane."
+    )
+    pincushion: float = Field(
+        description="Largest factor over the cameras by which the distortion moves the middle of "
+        "the shorter edge outwards; 1 without distortion, smaller for a barrel."
     )
     focal_relative: float | None = Field(
         description="Median over the images of the focal length over the longer side; null if all "
@@ -302,6 +309,17 @@ def _weaknesses(e: Evidence) -> list[_Finding]:
     """The defects of weak models alone."""
     off = e.focal_off or 1.0
     return [
+        _Finding(
+            e.focal_off is not None and off <= MAX_FOCAL_OFF and e.focal_certainty == 0,
+            "the focal length agrees with EXIF, but another one fits the photographs better",
+            _FOCAL,
+        ),
+        _Finding(
+            e.pincushion > MAX_PINCUSHION,
+            f"the lens distortion moves the edge of the image outwards by {e.pincushion - 1:.0%}, "
+            "more than lenses do: the focal length may be wrong",
+            _FOCAL,
+        ),
         _Finding(
             off > MAX_FOCAL_OFF and not _contradicts_exif(e),
             f"the focal length differs from EXIF by a factor of {off:.1f}, and the photographs do "

@@ -94,6 +94,9 @@ def test_signs_of_a_fold_decide(changed, expected):
         # At the focal length of EXIF the cost would rise much, or little.
         ({"focal_off": 3.0, "focal_certainty": 0.01}, "good"),
         ({"focal_off": 1.4, "focal_certainty": 0.01}, "weak"),
+        # EXIF is wrong: the model is not the best one near it, or its distortion makes up for it.
+        ({"focal_off": 1.05, "focal_certainty": 0.0}, "weak"),
+        ({"focal_off": 1.02, "focal_certainty": None, "pincushion": 1.4}, "weak"),
         # A camera that turned by hand, and one with a short baseline.
         ({"parallax": 0.0025, "median_angle_deg": 8.0}, "failed"),
         ({"parallax": 0.005, "median_angle_deg": 2.5}, "good"),

@@ -117,7 +117,7 @@ def _pincushion(view: ModelView) -> float:
     middle = np.array([[camera.width, camera.height]]) / 2
     edge = middle * (np.array([2, 1]) if camera.width >= camera.height else np.array([1, 2]))
     ray = np.asarray(camera.cam_from_img(edge), np.float64)
-    return float(view.longer_side / 2 / max(np.linalg.norm(ray) * view.focal, 1e-12))
+    return view.longer_side / 2 / max(float(np.linalg.norm(ray)) * view.focal, 1e-12)
 
 
 def focal_priors(database: Path) -> dict[int, float]:

@@ -19,6 +19,7 @@ GOOD = Evidence(
     agreeing_matches=0.99,
     agreeing_pairs=1.0,
     agreeing_distinctive=1.0,
+    pairs_left_out=False,
     broken_steps=0,
     missing_covisibility=0.02,
     behind_camera=0.0,

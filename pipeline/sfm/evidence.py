@@ -92,6 +92,7 @@ def collect_evidence(
         reprojection_px=float(model.compute_mean_reprojection_error()),
         explained_matches=_explained_matches(views, pairs),
         **consistency._asdict(),
+        pairs_left_out=len(verified) < len(every),
         broken_steps=len(broken),
         behind_camera=behind,
         parallax=_parallax(views, pairs),

@@ -1,11 +1,11 @@
 """Pairs of photographs of which the matches can be trusted although parts look alike.
 
-Distinctive pairs are trusted first. Their matches continue from photograph to photograph: a pair of
-two photographs that a trusted third one connects is trusted if its own matches lead to the same
-keypoints, and is rejected if they lead elsewhere (conflicts across triplets: Zach, Klopschitz,
-Pollefeys 2010, *Disambiguating Visual Relations Using Loop Constraints*). The groups of photographs
-that trusted pairs connect are then connected by the pairs that share most keypoints which match
-nothing else outside their group.
+Distinctive pairs are chosen first. Their matches continue from photograph to photograph: a pair of
+two photographs that both have a chosen pair with a third is trusted if its own matches lead to the
+same keypoints there, and is not if they lead elsewhere (conflicts across triplets: Zach,
+Klopschitz, Pollefeys 2010, *Disambiguating Visual Relations Using Loop Constraints*). The groups of
+photographs that trusted pairs connect are then connected by the pairs that share most keypoints
+which match few other photographs.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ class TrustedPairs:
             left, right = matches.astype(np.int64).T
             self._partners[a][b] = _lookup(left, right, len(keypoints[a]))
             self._partners[b][a] = _lookup(right, left, len(keypoints[b]))
+        # The photographs with which each has a chosen pair.
         self._neighbours: dict[int, set[int]] = {image: set() for image in keypoints}
 
     @property
@@ -56,22 +57,15 @@ class TrustedPairs:
         return len(set(self._group.values()))
 
     def trust(self, chosen: Collection[Pair]) -> None:
-        """Trust these pairs, and those that follow from them."""
-        fresh = sorted(set(chosen) - self.trusted)
-        while fresh:
-            touched: set[Pair] = set()
-            for a, b in fresh:
-                self.trusted.add((a, b))
-                self._link(a, b)
-                self._merge(a, b)
-            for a, b in fresh:
-                touched |= {_sorted(a, c) for c in self._neighbours[b]}
-                touched |= {_sorted(b, c) for c in self._neighbours[a]}
-            fresh = [
-                pair
-                for pair in sorted(touched & self._pairs.keys() - self.trusted)
-                if self._is_confirmed(*pair)
-            ]
+        """Trust these pairs, and those that follow from two of them. What follows confirms no
+        further pairs: a single wrong pair would spread."""
+        fresh = sorted((a, b) for a, b in set(chosen) if b not in self._neighbours[a])
+        for a, b in fresh:
+            self.trusted.add((a, b))
+            self._link(a, b)
+            self._merge(a, b)
+        for a, b in fresh:
+            self.trusted |= self._following(a, b)
 
     def connect(self) -> None:
         """Connect groups: trust the most distinctive pair of two groups if other pairs confirm it.
@@ -94,13 +88,18 @@ class TrustedPairs:
 
     def _is_supported(self, a: int, b: int) -> bool:
         """Whether enough other pairs between the groups would follow from this one."""
-        beside = {_sorted(a, c) for c in self._neighbours[b]}
-        beside |= {_sorted(b, c) for c in self._neighbours[a]}
         self._link(a, b)
-        following = sum(self._is_confirmed(*pair) for pair in beside & self._pairs.keys())
+        following = self._following(a, b)
         self._neighbours[a].remove(b)
         self._neighbours[b].remove(a)
-        return following >= MIN_FOLLOWING
+        return len(following) >= MIN_FOLLOWING
+
+    def _following(self, a: int, b: int) -> set[Pair]:
+        """The pairs that follow from a chosen pair and another one of one of its photographs."""
+        beside = {_sorted(a, c) for c in self._neighbours[b] - {a}}
+        beside |= {_sorted(b, c) for c in self._neighbours[a] - {b}}
+        new = beside & self._pairs.keys() - self.trusted
+        return {pair for pair in new if self._is_confirmed(*pair)}
 
     def _link(self, a: int, b: int) -> None:
         self._neighbours[a].add(b)

@@ -27,7 +27,7 @@ MAX_MISSING_COVISIBILITY = (0.35, 0.15)
 # The threshold of weak models if the strong and the distinctive pairs all agree: photographs far
 # apart around a thing observe few common points.
 ALL_AGREE, MAX_MISSING_COVISIBILITY_ALL_AGREE = 0.995, 0.3
-# Both thresholds if pairs were left out, because those that are left agree by their choice.
+# The same if pairs were left out, because those that are left agree by their choice.
 MAX_MISSING_COVISIBILITY_LEFT_OUT = 0.22
 # A model that exceeds both is folded, although each alone would only be weak.
 FOLDED_AGREEING, FOLDED_MISSING_COVISIBILITY = 0.97, 0.15
@@ -214,7 +214,7 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
         e.agreeing_pairs < FOLDED_AGREEING and e.missing_covisibility > FOLDED_MISSING_COVISIBILITY
     )
     most_missing = MAX_MISSING_COVISIBILITY[level]
-    if e.pairs_left_out:
+    if not failed and e.pairs_left_out:
         most_missing = MAX_MISSING_COVISIBILITY_LEFT_OUT
     elif not failed and min(e.agreeing_pairs, e.agreeing_distinctive) >= ALL_AGREE:
         most_missing = MAX_MISSING_COVISIBILITY_ALL_AGREE

@@ -19,6 +19,7 @@ GOOD = Evidence(
     agreeing_matches=0.99,
     agreeing_pairs=1.0,
     agreeing_distinctive=1.0,
+    pairs_left_out=False,
     broken_steps=0,
     missing_covisibility=0.02,
     behind_camera=0.0,
@@ -26,6 +27,7 @@ GOOD = Evidence(
     median_angle_deg=12.0,
     focal_off=1.05,
     focal_certainty=0.8,
+    pincushion=1.0,
     focal_relative=0.9,
 )
 INSPECT = InspectCounters(photos=7, left_out=1)

@@ -21,8 +21,9 @@ ROTATION_DEG, CENTRE_SHARE = 5.0, 0.05
 # The shares of correct views among those with a pose and a true one: a model is good from the
 # first, and has failed below the second.
 GOOD_SHARE, FAILED_SHARE = 0.9, 0.6
-# A model with a smaller share of the photographs has failed.
-LEAST_REGISTERED = 0.5
+# A model with a smaller share of the photographs has failed, and is not good, however right its
+# views are.
+FAILED_REGISTERED, GOOD_REGISTERED = 0.5, 0.8
 # Cameras that moved less, as a share of their distance to the scene, observe no depth.
 MIN_TRUE_MOTION = 0.01
 HYPOTHESES = 600
@@ -34,7 +35,8 @@ class Truth:
 
     Attributes:
         grade: The grade by ``share``. It is "failed" too if there is no model or one of too few
-            photographs, or if the true cameras never moved.
+            photographs, or if the true cameras never moved; a model that lacks some of the
+            photographs is at most "weak".
         share: The share of correct views among those that have a pose and a true one.
         common: The number of views that have a pose and a true one.
         rotation_deg, centre: The median errors over those of these views that show the model's
@@ -87,9 +89,10 @@ def grade(
     right = (rotation <= ROTATION_DEG) & (relative <= CENTRE_SHARE)
     share = float(right.sum()) / common
     still = depth is not None and radius < MIN_TRUE_MOTION * depth
-    verdict: Grade = "good" if share >= GOOD_SHARE else "weak"
-    few = len(estimated.images) < LEAST_REGISTERED * total
-    if share < FAILED_SHARE or still or few:
+    registered = len(estimated.images) / total
+    is_good = share >= GOOD_SHARE and registered >= GOOD_REGISTERED
+    verdict: Grade = "good" if is_good else "weak"
+    if share < FAILED_SHARE or still or registered < FAILED_REGISTERED:
         verdict = "failed"
     return Truth(verdict, share, common, _median(rotation), _median(relative))
 

@@ -40,6 +40,8 @@ FISHEYE_FOCAL = 0.4
 # A lens with a focal length over the longer side below this may be a fisheye.
 FISHEYE_BELOW = 0.6
 
+LOOK_ALIKES_LEFT_OUT = "pairs left out that contradict the most distinctive ones"
+
 # Maximum number of reconstructions of a scene.
 MAX_ATTEMPTS = 4
 
@@ -102,7 +104,7 @@ def map_until_good(
 
     def attempt_with(path: Path, mapper: Mapper, change: str) -> Attempt:
         models = run_mapper(mapper, path, total, seed)
-        evidence = collect_evidence(models[0], path, total, steps) if models else None
+        evidence = collect_evidence(models[0], path, total, steps, database) if models else None
         return Attempt(mapper, change, models, evidence, judge(evidence, min_share), path)
 
     def leave_out(target: Path) -> bool:
@@ -125,11 +127,17 @@ def map_until_good(
         attempts.append(attempt)
         if _rank(attempt) > _rank(best):
             best = attempt
+        if change == LOOK_ALIKES_LEFT_OUT and attempt.verdict.grade != "failed":
+            # The others use the pairs that contradict this model.
+            break
     records = [attempt.record(attempt is best) for attempt in attempts]
     return replace(best, spare=_spare(best, attempts)), records
 
 
 def _spare(best: Attempt, attempts: Sequence[Attempt]) -> list[pycolmap.Reconstruction]:
+    if best.change == LOOK_ALIKES_LEFT_OUT:
+        # The others may be folded, and no pair is left that would contradict them.
+        return []
     registered = {image_id for model in best.models for image_id in model.reg_image_ids()}
     return [
         model
@@ -183,7 +191,7 @@ def _without_look_alikes(
         or min(e.agreeing_pairs, e.agreeing_distinctive) < MIN_AGREEING_PAIRS[1]
         or e.missing_covisibility > MAX_MISSING_COVISIBILITY[1]
     ):
-        yield first.mapper, "pairs left out that contradict the most distinctive ones", leave_out
+        yield first.mapper, LOOK_ALIKES_LEFT_OUT, leave_out
 
 
 def _rank(attempt: Attempt) -> tuple[int, float]:

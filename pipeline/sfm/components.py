@@ -76,6 +76,7 @@ class Capture:
         total: The number of photographs of the scene.
         min_share: The share of registered images below which a model has failed.
         steps: The result of ``sequence_steps``.
+        original: The database of all pairs, if pairs were left out of ``database``.
     """
 
     database: Path
@@ -83,10 +84,11 @@ class Capture:
     min_share: float
     seed: int
     steps: tuple[Names, ...] = ()
+    original: Path | None = None
 
     def judged(self, model: pycolmap.Reconstruction) -> Component:
         """A model with its quality."""
-        evidence = collect_evidence(model, self.database, self.total, self.steps)
+        evidence = collect_evidence(model, self.database, self.total, self.steps, self.original)
         return Component(model, evidence, self.verdict(evidence))
 
     def verdict(self, evidence: Evidence) -> Verdict:

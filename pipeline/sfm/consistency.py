@@ -74,7 +74,7 @@ def measure_consistency(
         for image_id in pair:
             strongest[image_id] = max(strongest.get(image_id, 0), len(inliers))
     for (first, second), inliers in pairs.items():
-        agree = _matches_agree(views[first], views[second], inliers)
+        agree = matches_agree(views[first], views[second], inliers)
         agreeing += int(agree.sum())
         matches += len(agree)
         if (first, second) in distinctive:
@@ -91,10 +91,10 @@ def measure_consistency(
 
 def pair_agrees(a: ModelView, b: ModelView, matches: NDArray[np.uint32]) -> bool:
     """Whether at least half of the (M, 2) verified matches of two images agree with their poses."""
-    return bool(_matches_agree(a, b, matches).mean() >= MIN_AGREEING_SHARE)
+    return bool(matches_agree(a, b, matches).mean() >= MIN_AGREEING_SHARE)
 
 
-def _matches_agree(a: ModelView, b: ModelView, matches: NDArray[np.uint32]) -> NDArray[np.bool_]:
+def matches_agree(a: ModelView, b: ModelView, matches: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """(M,) True for matches that satisfy the essential matrix of the pair's relative pose (by the
     Sampson distance) and triangulate in front of both cameras."""
     rotation = b.rotation @ a.rotation.T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import pairwise
 
 import numpy as np
@@ -45,9 +45,9 @@ def broken_steps(
 ) -> list[Names]:
     """The steps at which a model turns the camera far more than the sequence does.
 
-    A step is broken if most of the verified pairs across it contradict the turn: without pairs it
-    is a cut, and with pairs that agree the camera turned. A single stray photograph breaks no step,
-    nor does one at an end of the sequence.
+    A step leads from one registered photograph to the next. It is broken if most of the verified
+    pairs across it contradict the turn: without pairs it is a cut, and with pairs that agree the
+    camera turned. A single stray photograph breaks no step, nor does one at an end of the sequence.
 
     Args:
         rotations: Name -> (3, 3) world to camera, of the registered photographs.
@@ -55,7 +55,7 @@ def broken_steps(
             model; None without a two-view geometry.
         steps: The result of ``sequence_steps``.
     """
-    known = [step for step in steps if step[0] in rotations and step[1] in rotations]
+    known = _between_known(steps, rotations.keys())
     turns = np.array([_turn(rotations[a], rotations[b]) for a, b in known])
     if len(turns) == 0:
         return []
@@ -80,6 +80,19 @@ def broken_steps(
     return [
         step for step, turn in zip(known, turns, strict=True) if turn > limit and is_broken(*step)
     ]
+
+
+def _between_known(steps: Sequence[Names], known: Set[str]) -> list[Names]:
+    """The steps from one known photograph to the next, across those that are not."""
+    found: list[Names] = []
+    last: dict[str, str] = {}
+    for a, b in steps:
+        start = a if a in known else last.get(a)
+        if start is not None and b in known:
+            found.append((start, b))
+        elif start is not None:
+            last[b] = start
+    return found
 
 
 def _turn(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

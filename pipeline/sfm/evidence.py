@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.sfm.consistency import measure_consistency, pair_agrees
 from pipeline.sfm.continuity import Names, broken_steps
 from pipeline.sfm.distinctive import distinctive_pairs
-from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
+from pipeline.sfm.judge import FOCAL_IMAGES, FOCAL_STEP, MAX_FOCAL_OFF, Evidence
 from pipeline.sfm.model_views import Floats, ModelView, Pairs, read_views
 
 # Size of the sample of pairs, and of matches of each, that pure rotation is fitted to.
@@ -27,13 +27,21 @@ PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 14))
 PARALLAX_STEP = float(np.log(PARALLAX_FOCALS[1] / PARALLAX_FOCALS[0]))
 PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
-# Focal certainty: factor by which focal lengths are changed, number of images (evenly spread) and
-# of iterations of the bundle adjustments.
-FOCAL_STEP, FOCAL_IMAGES, FOCAL_ITERATIONS = 1.2, 30, 8
+# Focal certainty: number of iterations of the bundle adjustments.
+FOCAL_ITERATIONS = 8
+HOMOGRAPHIES = (
+    pycolmap.TwoViewGeometryConfiguration.PLANAR,
+    pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+    pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+)
 
 
 def collect_evidence(
-    model: pycolmap.Reconstruction, database: Path, total: int, steps: Sequence[Names] = ()
+    model: pycolmap.Reconstruction,
+    database: Path,
+    total: int,
+    steps: Sequence[Names] = (),
+    original: Path | None = None,
 ) -> Evidence:
     """Compute the statistics of ``model``.
 
@@ -41,14 +49,19 @@ def collect_evidence(
         database: The database that the model was mapped from.
         total: The number of photographs of the scene.
         steps: The result of ``sequence_steps``.
+        original: The database of all pairs, which determines the distinctive ones, if pairs were
+            left out of ``database``.
     """
     with pycolmap.Database.open(database) as opened:
-        verified = read_verified_pairs(opened)
+        verified = every = read_verified_pairs(opened)
         views = read_views(model, opened)
         names = {image.image_id: image.name for image in opened.read_all_images()}
+    if original is not None and original != database:
+        with pycolmap.Database.open(original) as opened:
+            every = read_verified_pairs(opened)
     pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
     behind, observations, angles = _geometry(model, views)
-    consistency = measure_consistency(model, views, pairs, distinctive_pairs(verified))
+    consistency = measure_consistency(model, views, pairs, distinctive_pairs(every))
     ids = {name: image_id for image_id, name in names.items()}
 
     def agrees(pair: Names) -> bool | None:
@@ -68,6 +81,7 @@ def collect_evidence(
     offs = [max(focal / prior, prior / max(focal, 1e-9)) for focal, prior in known]
     focal_off = float(np.median(offs)) if offs else None
     agrees_with_exif = focal_off is not None and focal_off <= MAX_FOCAL_OFF
+    is_unsure = not agrees_with_exif or _shows_plane(database)
     return Evidence(
         registered=len(views),
         total=total,
@@ -78,14 +92,33 @@ def collect_evidence(
         reprojection_px=float(model.compute_mean_reprojection_error()),
         explained_matches=_explained_matches(views, pairs),
         **consistency._asdict(),
+        pairs_left_out=len(verified) < len(every),
         broken_steps=len(broken),
         behind_camera=behind,
         parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=None if agrees_with_exif or not relative else focal_certainty(model),
+        focal_certainty=focal_certainty(model) if is_unsure and relative else None,
+        pincushion=max((_pincushion(view) for view in flat if not view.is_wide), default=1.0),
         focal_relative=float(np.median(relative)) if relative else None,
     )
+
+
+def _shows_plane(database: Path) -> bool:
+    """Whether a homography explains most of the verified pairs."""
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    of_pairs = [g.config in HOMOGRAPHIES for g in geometries if len(g.inlier_matches) > 0]
+    return bool(of_pairs) and 2 * sum(of_pairs) > len(of_pairs)
+
+
+def _pincushion(view: ModelView) -> float:
+    """The factor by which the distortion moves the middle of the image's shorter edge outwards."""
+    camera = view.camera
+    middle = np.array([[camera.width, camera.height]]) / 2
+    edge = middle * (np.array([2, 1]) if camera.width >= camera.height else np.array([1, 2]))
+    ray = np.asarray(camera.cam_from_img(edge), np.float64)
+    return view.longer_side / 2 / max(float(np.linalg.norm(ray)) * view.focal, 1e-12)
 
 
 def focal_priors(database: Path) -> dict[int, float]:

@@ -9,6 +9,7 @@ whether the images determine the focal length at all.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,19 +27,31 @@ MAX_MISSING_COVISIBILITY = (0.35, 0.15)
 # The threshold of weak models if the strong and the distinctive pairs all agree: photographs far
 # apart around a thing observe few common points.
 ALL_AGREE, MAX_MISSING_COVISIBILITY_ALL_AGREE = 0.995, 0.3
+# The same if pairs were left out, because those that are left agree by their choice.
+MAX_MISSING_COVISIBILITY_LEFT_OUT = 0.22
 # A model that exceeds both is folded, although each alone would only be weak.
 FOLDED_AGREEING, FOLDED_MISSING_COVISIBILITY = 0.97, 0.15
 # Below this, pure rotation explains the matches up to noise (half a pixel).
 MIN_PARALLAX = (0.0018, 0.004)
+# With a parallax below the first, a model whose parallax over its median angle in radians is below
+# the second took noise of the matches for depth.
+SMALL_PARALLAX, MIN_PARALLAX_PER_ANGLE = 0.006, 0.08
 MAX_BEHIND = 0.01
 # Focal length over the longer side: lenses from 8 mm to 600 mm on 35 mm film.
 FOCAL_RANGE = (0.22, 17.0)
 # EXIF focal lengths are rounded by a few per cent. A larger ratio means a cropped image or a wrong
 # model.
 MAX_FOCAL_OFF = 1.3
-# If the cost rises by a smaller share for a focal length that is off by 20%, the images do not
-# determine the focal length (planar scenes, forward motion).
+# If the cost rises by a smaller share for another focal length, the images do not determine which
+# one is correct (planar scenes, forward motion).
 MIN_FOCAL_CERTAINTY = 0.1
+# The factor by which focal lengths are changed for ``focal_certainty``, and the number of images.
+FOCAL_STEP, FOCAL_IMAGES = 1.2, 30
+# Largest standard deviation of a focal length without EXIF, relative to it. The residuals of an
+# image count as at most so many independent ones: errors of the camera model are common to them.
+MAX_FOCAL_DEVIATION, MAX_RESIDUALS_PER_IMAGE = 0.05, 250
+# The distortion of a model whose focal length is wrong may make up for it. Tele lenses have 1.05.
+MAX_PINCUSHION = 1.3
 MIN_SHARE_GOOD = 0.8
 MAX_REPROJECTION_WEAK_PX = 2.0
 # Median triangulation angle below which the baseline is too short for reliable depths.
@@ -90,6 +103,10 @@ class Evidence(BaseModel):
         description="Share of the distinctive pairs of which at least half of the matches agree. "
         "Distinctive pairs share what few other images show, hence they are no look-alikes."
     )
+    pairs_left_out: bool = Field(
+        description="Whether the model was mapped without the pairs that contradict trusted ones. "
+        "Then ``agreeing_pairs`` is of the pairs that were kept, and says less."
+    )
     broken_steps: int = Field(
         description="Number of steps between neighbours of a sequence at which the model turns the "
         "camera far more than the sequence does, and most verified pairs across it contradict that."
@@ -114,7 +131,12 @@ class Evidence(BaseModel):
     )
     focal_certainty: float | None = Field(
         description="Smallest relative increase of the bundle adjustment cost for a focal length "
-        "that is off by 20 %; null (not computed) if the focal length agrees with EXIF."
+        "that is off by 20 %; null (not computed) if the focal length agrees with EXIF and the "
+        "photographs do not show a plane."
+    )
+    pincushion: float = Field(
+        description="Largest factor over the cameras by which the distortion moves the middle of "
+        "the shorter edge outwards; 1 without distortion, smaller for a barrel."
     )
     focal_relative: float | None = Field(
         description="Median over the images of the focal length over the longer side; null if all "
@@ -192,7 +214,9 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
         e.agreeing_pairs < FOLDED_AGREEING and e.missing_covisibility > FOLDED_MISSING_COVISIBILITY
     )
     most_missing = MAX_MISSING_COVISIBILITY[level]
-    if not failed and min(e.agreeing_pairs, e.agreeing_distinctive) >= ALL_AGREE:
+    if not failed and e.pairs_left_out:
+        most_missing = MAX_MISSING_COVISIBILITY_LEFT_OUT
+    elif not failed and min(e.agreeing_pairs, e.agreeing_distinctive) >= ALL_AGREE:
         most_missing = MAX_MISSING_COVISIBILITY_ALL_AGREE
     return [
         _Finding(
@@ -239,6 +263,26 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
     ]
 
 
+def _contradicts_exif(e: Evidence) -> bool:
+    """Whether the cost would rise clearly at the focal length from EXIF (a parabola through the
+    rise at ``FOCAL_STEP``)."""
+    if e.focal_certainty is None or e.focal_off is None:
+        return True
+    steps = math.log(max(e.focal_off, FOCAL_STEP)) / math.log(FOCAL_STEP)
+    return e.focal_certainty * steps**2 >= MIN_FOCAL_CERTAINTY
+
+
+def _determines_focal(e: Evidence) -> bool:
+    """Whether the images determine the focal length: by a clear rise of the cost, or by the
+    standard deviation that follows from the rise and the number of residuals."""
+    if e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY:
+        return True
+    free = 2 * e.observations_per_image - 3 * e.points / max(e.registered, 1)
+    residuals = min(free, MAX_RESIDUALS_PER_IMAGE) * min(e.registered, FOCAL_IMAGES)
+    steps = MAX_FOCAL_DEVIATION / (FOCAL_STEP - 1)
+    return e.focal_certainty * residuals * steps**2 >= 1
+
+
 def _failures(e: Evidence) -> list[_Finding]:
     """The defects of failed models alone."""
     return [
@@ -255,6 +299,13 @@ def _failures(e: Evidence) -> list[_Finding]:
             _REPEATED,
         ),
         _Finding(
+            e.parallax < SMALL_PARALLAX
+            and e.parallax < MIN_PARALLAX_PER_ANGLE * math.radians(e.median_angle_deg),
+            "the camera hardly moved: the matches show too little parallax for the depths of the "
+            "model",
+            _MOVE,
+        ),
+        _Finding(
             e.behind_camera > MAX_BEHIND,
             f"{e.behind_camera:.0%} of the points are behind their cameras",
             _MOVE,
@@ -265,16 +316,26 @@ def _failures(e: Evidence) -> list[_Finding]:
 def _weaknesses(e: Evidence) -> list[_Finding]:
     """The defects of weak models alone."""
     off = e.focal_off or 1.0
-    focal_determined = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
     return [
         _Finding(
-            off > MAX_FOCAL_OFF and not focal_determined,
+            e.focal_off is not None and off <= MAX_FOCAL_OFF and e.focal_certainty == 0,
+            "the focal length agrees with EXIF, but another one fits the photographs better",
+            _FOCAL,
+        ),
+        _Finding(
+            e.pincushion > MAX_PINCUSHION,
+            f"the lens distortion moves the edge of the image outwards by {e.pincushion - 1:.0%}, "
+            "more than lenses do: the focal length may be wrong",
+            _FOCAL,
+        ),
+        _Finding(
+            off > MAX_FOCAL_OFF and not _contradicts_exif(e),
             f"the focal length differs from EXIF by a factor of {off:.1f}, and the photographs do "
             "not determine which one is correct",
             _FOCAL,
         ),
         _Finding(
-            e.focal_off is None and not focal_determined,
+            e.focal_off is None and not _determines_focal(e),
             "the photographs hardly determine the focal length: they show a plane from the front, "
             "the camera moved straight ahead, or they are not sharp",
             _FOCAL,

@@ -101,7 +101,8 @@ def reconstruct(
             work, config.mapper, total, config.min_registered_share, seed, steps=steps
         )
         decisions = [_describe(record, total) for record in attempts]
-        capture = Capture(attempt.database, total, config.min_registered_share, seed, tuple(steps))
+        share = config.min_registered_share
+        capture = Capture(attempt.database, total, share, seed, tuple(steps), work)
         components, more = find_components(attempt, capture, partial(_refined, config, capture))
         chosen, chosen_by = _choose(components, capture, config)
         decisions += more + chosen_by

@@ -260,7 +260,7 @@ def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
         ({"observations_per_image": 40}, "weak", "only 40 points"),
         ({"focal_off": 2.5}, "good", None),
         ({"focal_off": 1.5, "focal_certainty": 0.02}, "weak", "by a factor of 1.5"),
-        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "hardly determine the focal length"),
+        ({"focal_off": None, "focal_certainty": 1e-3}, "weak", "hardly determine the focal length"),
         ({"agreeing_pairs": 0.8}, "failed", "20% of the strongest pairs"),
         ({"agreeing_pairs": 0.95}, "weak", "5% of the strongest pairs"),
         ({"agreeing_distinctive": 0.9}, "failed", "no other photograph shows"),
@@ -271,7 +271,7 @@ def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
         ({"agreeing_pairs": 0.96, "missing_covisibility": 0.2}, "failed", "look alike"),
         ({"focal_relative": 0.1}, "failed", "0.10 times the image"),
         ({"behind_camera": 0.2}, "failed", "20% of the points are behind"),
-        ({"parallax": 0.003}, "weak", "only turned"),
+        ({"parallax": 0.003, "median_angle_deg": 2.1}, "weak", "only turned"),
         ({"parallax": 0.001}, "failed", "only turned"),
         ({"median_angle_deg": 0.5}, "weak", "hardly moved"),
     ],
@@ -295,5 +295,6 @@ def test_a_verdict_has_remedies_and_whether_another_attempt_may_help():
     complete = judge(GOOD.model_copy(update={"registered": 12, "reachable": 12}), 0.5)
     assert complete.grade == "weak" and not complete.worth_retrying
     assert judge(GOOD.model_copy(update={"registered": 12}), 0.5).worth_retrying
-    both = judge(GOOD.model_copy(update={"registered": 12, "parallax": 0.003}), 0.5)
+    slight = {"registered": 12, "parallax": 0.003, "median_angle_deg": 2.1}
+    both = judge(GOOD.model_copy(update=slight), 0.5)
     assert both.grade == "weak" and not both.worth_retrying

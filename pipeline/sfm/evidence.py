@@ -135,27 +135,25 @@ def _geometry(
     model: pycolmap.Reconstruction, views: dict[int, ModelView]
 ) -> tuple[float, int, Floats]:
     """Share of the observations behind their camera, number of observations, and (P,) angles in
-    degrees of each point: the largest between the first ray of its track and any other."""
-    poses, wide = {}, {}
-    for image_id, view in views.items():
-        matrix = np.column_stack([view.rotation, view.translation])
-        poses[image_id] = (matrix[2], view.centre)
-        if view.is_wide:
-            wide[image_id] = view.rays @ matrix
-    behind, observations = 0, 0
-    angles = np.zeros(model.num_points3D())
-    for index, point in enumerate(model.points3D.values()):
-        seen = [poses[element.image_id] for element in point.track.elements]
-        axes, centres = (np.array(column) for column in zip(*seen, strict=True))
-        for row, element in enumerate(point.track.elements):
-            if element.image_id in wide:
-                # A wide lens sees behind its plane: the point must be along the keypoint's ray.
-                axes[row] = wide[element.image_id][element.point2D_idx]
-        behind += int((axes[:, :3] @ point.xyz + axes[:, 3] <= 0).sum())
+    degrees of each point: the largest between the ray of its first image and any other."""
+    ids = np.array(sorted(model.point3D_ids()), np.int64)
+    xyz = np.array([model.point3D(i).xyz for i in ids.tolist()]).reshape(-1, 3)
+    first, is_known = np.zeros((len(ids), 3)), np.zeros(len(ids), bool)
+    cosines, behind, observations = np.ones(len(ids)), 0, 0
+    for view in views.values():
+        seen = np.flatnonzero(view.observed >= 0)
+        index = np.searchsorted(ids, view.observed[seen])
+        local = xyz[index] @ view.rotation.T + view.translation
+        # A wide lens sees behind its plane: the point must be along the keypoint's ray.
+        depth = (local * view.rays[seen]).sum(1) if view.is_wide else local[:, 2]
+        behind += int((depth <= 0).sum())
         observations += len(seen)
-        rays = centres - point.xyz
+        rays = view.centre - xyz[index]
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        angles[index] = np.degrees(np.arccos(np.clip((rays @ rays[0]).min(), -1, 1)))
+        new = ~is_known[index]
+        first[index[new]], is_known[index] = rays[new], True
+        np.minimum.at(cosines, index, (rays * first[index]).sum(1))
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     return behind / max(observations, 1), observations, angles
 
 

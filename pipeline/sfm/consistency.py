@@ -27,6 +27,9 @@ from pipeline.sfm.pairs import proximity_pairs
 MAX_SAMPSON_DISTANCE = 0.006
 # A pair agrees with the model if at least this share of its matches agree.
 MIN_AGREEING_SHARE = 0.5
+# Below this share a distinctive pair contradicts the model: folded models show at most 0.25, and the
+# few noisy matches of blurred photographs may agree by half.
+MIN_DISTINCTIVE_SHARE = 0.35
 # A pair is strong if it has at least this share of the matches of the strongest pair of one of its
 # images. Weaker pairs are ignored: repeated structure verifies them falsely, and they contradict
 # correct models.
@@ -78,7 +81,7 @@ def measure_consistency(
         agreeing += int(agree.sum())
         matches += len(agree)
         if (first, second) in distinctive:
-            distinctive_agree.append(bool(agree.mean() >= MIN_AGREEING_SHARE))
+            distinctive_agree.append(bool(agree.mean() >= MIN_DISTINCTIVE_SHARE))
         if len(agree) >= STRONG_SHARE * min(strongest[first], strongest[second]):
             strong_pairs_agree.append(bool(agree.mean() >= MIN_AGREEING_SHARE))
     return Consistency(

@@ -100,7 +100,7 @@ class Evidence(BaseModel):
         description="Share of the strong pairs of which at least half of the matches agree."
     )
     agreeing_distinctive: float = Field(
-        description="Share of the distinctive pairs of which at least half of the matches agree. "
+        description="Share of the distinctive pairs of which at least 35 % of the matches agree. "
         "Distinctive pairs share what few other images show, hence they are no look-alikes."
     )
     pairs_left_out: bool = Field(

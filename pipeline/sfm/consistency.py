@@ -27,8 +27,8 @@ from pipeline.sfm.pairs import proximity_pairs
 MAX_SAMPSON_DISTANCE = 0.006
 # A pair agrees with the model if at least this share of its matches agree.
 MIN_AGREEING_SHARE = 0.5
-# Below this share a distinctive pair contradicts the model: folded models show at most 0.25, and the
-# few noisy matches of blurred photographs may agree by half.
+# A distinctive pair contradicts the model below this share: folded models show at most 0.25, and
+# the few noisy matches of blurred photographs may agree by half.
 MIN_DISTINCTIVE_SHARE = 0.35
 # A pair is strong if it has at least this share of the matches of the strongest pair of one of its
 # images. Weaker pairs are ignored: repeated structure verifies them falsely, and they contradict

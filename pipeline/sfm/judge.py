@@ -22,6 +22,7 @@ Grade = Literal["good", "weak", "failed"]
 MIN_EXPLAINED = (0.20, 0.40)
 MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
+# The second fails a model without look-alikes too: it was mapped from pairs that it contradicts.
 MIN_AGREEING_DISTINCTIVE = (0.96, 0.98)
 MAX_MISSING_COVISIBILITY = (0.35, 0.15)
 # The threshold of weak models if the strong and the distinctive pairs all agree: photographs far
@@ -242,7 +243,7 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
             _REPEATED,
         ),
         _Finding(
-            e.agreeing_distinctive < MIN_AGREEING_DISTINCTIVE[level],
+            e.agreeing_distinctive < MIN_AGREEING_DISTINCTIVE[1 if e.pairs_left_out else level],
             f"{1 - e.agreeing_distinctive:.0%} of the pairs that share what no other photograph "
             "shows contradict the model: different parts that look alike may have been merged",
             _REPEATED,

@@ -76,6 +76,7 @@ def test_wrong_models_that_register_all_images_are_failed(case, tmp_path):
         ({"missing_covisibility": 0.25, "pairs_left_out": True}, "weak"),
         ({"missing_covisibility": 0.18, "pairs_left_out": True}, "good"),
         ({"agreeing_distinctive": 0.97}, "weak"),
+        ({"agreeing_distinctive": 0.97, "pairs_left_out": True}, "failed"),
         ({"agreeing_distinctive": 0.95}, "failed"),
         ({"broken_steps": 1}, "failed"),
     ],

@@ -22,6 +22,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.background import SceneBackground
 from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.georeference import Georeference
+from pipeline.sfm.uncertainty_file import Uncertainty
 from pipeline.training.loop.curve import TrainingCurve
 from stages.workflow.project import SnakemakeProject
 from stages.workflow.registry import STAGES
@@ -97,7 +98,7 @@ def test_counters_and_plan_fit_their_models(finished, tmp_path):
 RECORDS = {"stage.json", ".stage.json", "run.json", "images.json", "transforms.json"}
 MODELS = (
     *(Metrics, Evaluation, CoverageRecord, Georeference, Frame, TrainingCurve, ExposureGains),
-    SceneBackground,
+    *(SceneBackground, Uncertainty),
 )
 
 

@@ -86,8 +86,12 @@ def _remove_outliers(model: pycolmap.Reconstruction) -> int:
 def _triangulate(model: pycolmap.Reconstruction, database: Path) -> None:
     """Triangulate, complete and merge tracks by the verified matches, in place."""
     max_error_px = max(TRIANGULATION_RESIDUALS * median_error(model), MIN_TRIANGULATION_PX)
+    known = pycolmap.DatabaseCacheOptions()
+    # The images of the model alone; also those that were placed without verified pairs.
+    known.image_names = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    known.load_all_images = True
     with pycolmap.Database.open(database) as opened:
-        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+        cache = pycolmap.DatabaseCache.create(opened, known)
     graph = cache.correspondence_graph
     manager = pycolmap.ObservationManager(model, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, manager)

@@ -41,7 +41,8 @@ def _adjust(given: Path, out: Path) -> tuple[str, float]:
 
 
 def _write_database(model: Any, path: Path) -> None:
-    """The database of a model: its keypoints, and the matches of its tracks."""
+    """The database of a model: its keypoints, and the matches of its tracks, but for those of the
+    last photograph, which was placed without verified pairs; and a photograph without a pose."""
     import pycolmap
 
     with pycolmap.Database.open(path) as database:
@@ -51,7 +52,11 @@ def _write_database(model: Any, path: Path) -> None:
             image = model.image(image_id)
             empty = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
             database.write_image(empty, use_image_id=True)
-            database.write_keypoints(image_id, np.array([point.xy for point in image.points2D]))
+            keypoints = np.array([point.xy for point in image.points2D])
+            database.write_keypoints(image_id, keypoints)
+        left_out = pycolmap.Image(name="left_out.png", camera_id=1, image_id=COUNT + 1)
+        database.write_image(left_out, use_image_id=True)
+        database.write_keypoints(COUNT + 1, keypoints)
         pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for point_id in sorted(model.point3D_ids()):
             track = sorted(
@@ -59,7 +64,7 @@ def _write_database(model: Any, path: Path) -> None:
                 for element in model.point3D(point_id).track.elements
             )
             for (a, i), (b, j) in combinations(track, 2):
-                pairs.setdefault((a, b), []).append((i, j))
+                pairs.setdefault((a, b if b < COUNT else COUNT + 1), []).append((i, j))
         for pair, matches in pairs.items():
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from pipeline.sfm.keypoint_variance import image_residuals
 from pipeline.sfm.uncertainty import camera_deviations
 
 # Smallest relative decrease of the robust cost for which a freed parameter is accepted. Parameters
@@ -126,16 +127,11 @@ def _camera_costs(model: pycolmap.Reconstruction, total: float) -> dict[int, _Co
     costs, residuals_of = dict[int, float](), Counter[int]()
     points = {i: point.xyz for i, point in model.points3D.items()}
     for image in images:
-        seen = image.get_observation_points2D()
-        xyz = np.array([points[p.point3D_id] for p in seen]).reshape(-1, 3)
-        pose, camera = image.cam_from_world(), model.camera(image.camera_id)
-        local = xyz @ pose.rotation.matrix().T + pose.translation
-        predicted = np.asarray(camera.img_from_cam(local), np.float64).reshape(-1, 2)
-        squares = ((predicted - np.array([p.xy for p in seen]).reshape(-1, 2)) ** 2).sum(1)
+        squares = (image_residuals(model, image, points)[1] ** 2).sum(1)
         # Cauchy's loss; Ceres' cost is half of the sum.
         cost = float(np.nansum(np.log1p(squares)) / 2)
         costs[image.camera_id] = costs.get(image.camera_id, 0.0) + cost
-        residuals_of[image.camera_id] += 2 * len(seen)
+        residuals_of[image.camera_id] += 2 * len(squares)
     return {i: _Cost(costs[i], max(residuals_of[i], 1)) for i in costs}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pycolmap
@@ -75,6 +75,24 @@ def _correlation(influences: Sequence[Floats], positions: Sequence[Floats]) -> f
     # The six parameters of each pose lower the sums over its cells.
     left = max(1 - 6 * len(influences) / (2 * cells), 0.5)
     return max(together / max(apart * left, 1e-300) - 1, 0.0)
+
+
+def image_residuals(
+    model: pycolmap.Reconstruction, image: pycolmap.Image, points: Mapping[int, Floats]
+) -> tuple[NDArray[np.int64], Floats]:
+    """The ids of the points that an image observes, (O,), and their reprojection errors in pixels,
+    (O, 2).
+
+    Args:
+        points: The positions of all points of the model by their ids.
+    """
+    seen = image.get_observation_points2D()
+    ids = np.array([point.point3D_id for point in seen], np.int64)
+    if not seen:
+        return ids, np.empty((0, 2))
+    local = image.cam_from_world() * np.array([points[i] for i in ids.tolist()])
+    projected = np.asarray(model.camera(image.camera_id).img_from_cam(local)).reshape(-1, 2)
+    return ids, projected - np.array([point.xy for point in seen])
 
 
 def loss_scale(model: pycolmap.Reconstruction) -> float:

@@ -16,7 +16,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipeline.sfm.keypoint_variance import RELIABLE_RESIDUALS, loss_scale, median_error
+from pipeline.sfm.keypoint_variance import (
+    RELIABLE_RESIDUALS,
+    image_residuals,
+    loss_scale,
+    median_error,
+)
 from pipeline.sfm.refine import EXACT_PX, adjust_points, bundle_adjust
 
 #: Observations with a larger reprojection error, and those behind their camera, are removed
@@ -113,8 +118,11 @@ def _take_unreliable(
     model: pycolmap.Reconstruction,
 ) -> list[tuple[NDArray[np.float64], pycolmap.Track]]:
     """Remove the tracks with large residuals from a model and return them."""
-    ids = np.array(sorted(model.point3D_ids()))
-    of_point, residuals = _residuals(model, ids)
+    points = {i: point.xyz for i, point in model.points3D.items()}
+    ids = np.array(sorted(points), np.int64)
+    found = [image_residuals(model, model.image(i), points) for i in sorted(model.reg_image_ids())]
+    of_point = np.searchsorted(ids, np.concatenate([seen for seen, _ in found]))
+    residuals = np.linalg.norm(np.concatenate([errors for _, errors in found]), axis=1)
     length = np.bincount(of_point, minlength=len(ids))
     squares = np.bincount(of_point, weights=residuals**2, minlength=len(ids))
     # A track of n keypoints has 2 n - 3 degrees of freedom.
@@ -127,23 +135,3 @@ def _take_unreliable(
         held.append((point.xyz.copy(), pycolmap.Track(elements)))
         manager.delete_point3D(int(point_id))
     return held
-
-
-def _residuals(
-    model: pycolmap.Reconstruction, ids: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """For each observation the index of its point in sorted ``ids``, and the reprojection error in
-    pixels; (N,) each."""
-    xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
-    of_point, residuals = [], []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.image(image_id)
-        seen = [point for point in image.points2D if point.has_point3D()]
-        if not seen:
-            continue
-        index = np.searchsorted(ids, [point.point3D_id for point in seen])
-        local = image.cam_from_world() * xyz[index]
-        projected = np.asarray(model.camera(image.camera_id).img_from_cam(local)).reshape(-1, 2)
-        of_point.append(index)
-        residuals.append(np.linalg.norm(projected - [point.xy for point in seen], axis=1))
-    return np.concatenate(of_point), np.concatenate(residuals)

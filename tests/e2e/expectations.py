@@ -36,7 +36,7 @@ MEASURED = {
     "psnr_db": 0.1,
     "train_psnr_db": 0.1,
     "ssim": 0.002,
-    "gaussians": 2.0,
+    "gaussians": 1.0,
     "cloned": 100.0,
     "split": 100.0,
     "pruned": 100.0,

@@ -86,9 +86,11 @@ class Capture:
     steps: tuple[Names, ...] = ()
     original: Path | None = None
 
-    def judged(self, model: pycolmap.Reconstruction) -> Component:
-        """A model with its quality."""
-        evidence = collect_evidence(model, self.database, self.total, self.steps, self.original)
+    def judged(self, model: pycolmap.Reconstruction, before: Evidence | None = None) -> Component:
+        """A model with its quality; ``before``: see ``collect_evidence``."""
+        evidence = collect_evidence(
+            model, self.database, self.total, self.steps, self.original, before
+        )
         return Component(model, evidence, self.verdict(evidence))
 
     def verdict(self, evidence: Evidence) -> Verdict:

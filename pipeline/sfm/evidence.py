@@ -3,6 +3,7 @@ database."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -29,6 +30,9 @@ PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
 # Focal certainty: number of iterations of the bundle adjustments.
 FOCAL_ITERATIONS = 8
+# Focal certainty: mean number of observations per image. The relative increase of the cost hardly
+# depends on it.
+FOCAL_OBSERVATIONS = 500
 HOMOGRAPHIES = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
     pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
@@ -42,6 +46,7 @@ def collect_evidence(
     total: int,
     steps: Sequence[Names] = (),
     original: Path | None = None,
+    before: Evidence | None = None,
 ) -> Evidence:
     """Compute the statistics of ``model``.
 
@@ -51,6 +56,8 @@ def collect_evidence(
         steps: The result of ``sequence_steps``.
         original: The database of all pairs, which determines the distinctive ones, if pairs were
             left out of ``database``.
+        before: The statistics of the model before refinement, whose ``focal_certainty`` is kept: it
+            belongs to the photographs, and a refined focal length is no new evidence.
     """
     with pycolmap.Database.open(database) as opened:
         verified = every = read_verified_pairs(opened)
@@ -81,7 +88,11 @@ def collect_evidence(
     offs = [max(focal / prior, prior / max(focal, 1e-9)) for focal, prior in known]
     focal_off = float(np.median(offs)) if offs else None
     agrees_with_exif = focal_off is not None and focal_off <= MAX_FOCAL_OFF
-    is_unsure = not agrees_with_exif or _shows_plane(database)
+    if before is not None:
+        certainty = before.focal_certainty
+    else:
+        is_unsure = not agrees_with_exif or _shows_plane(database)
+        certainty = focal_certainty(model) if is_unsure and relative else None
     return Evidence(
         registered=len(views),
         total=total,
@@ -98,7 +109,7 @@ def collect_evidence(
         parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=focal_certainty(model) if is_unsure and relative else None,
+        focal_certainty=certainty,
         pincushion=max((_pincushion(view) for view in flat if not view.is_wide), default=1.0),
         focal_relative=float(np.median(relative)) if relative else None,
     )
@@ -275,7 +286,7 @@ def focal_certainty(model: pycolmap.Reconstruction) -> float:
     """Smallest relative increase of the robust cost if the focal lengths are held 20% smaller or
     larger while all other parameters are adjusted. Near 0, the images do not determine the focal
     length (fronto-parallel planes, pure rotation, forward motion)."""
-    base = pycolmap.Reconstruction(model)
+    base = _with_fewer_points(model)
     best = _adjusted_cost(base, refine_focal=True)
     rises = []
     for factor in (1 / FOCAL_STEP, FOCAL_STEP):
@@ -286,6 +297,20 @@ def focal_certainty(model: pycolmap.Reconstruction) -> float:
             camera.params = params
         rises.append(_adjusted_cost(trial, refine_focal=False) / max(best, 1e-12) - 1)
     return max(float(min(rises)), 0.0)
+
+
+def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with every n-th point: about ``FOCAL_OBSERVATIONS`` for each image."""
+    copy = pycolmap.Reconstruction(model)
+    images = max(model.num_reg_images(), 1)
+    share = int(model.compute_num_observations()) / (images * FOCAL_OBSERVATIONS)
+    every = math.ceil(share)
+    if every > 1:
+        manager = pycolmap.ObservationManager(copy)
+        for number, point_id in enumerate(sorted(copy.point3D_ids())):
+            if number % every:
+                manager.delete_point3D(point_id)
+    return copy
 
 
 def _adjusted_cost(model: pycolmap.Reconstruction, *, refine_focal: bool) -> float:

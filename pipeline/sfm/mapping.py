@@ -167,12 +167,11 @@ def _refined(
         refined = refine_weak(component.model, focal_priors(capture.database))
         model, decisions = refined.model, refined.decisions
     # The report describes the refined model.
-    found = capture.judged(model)
+    found = capture.judged(model, component.evidence)
     if alone == "good":
         return replace(found, verdict=component.verdict), decisions
     # A focal length that was set to that of EXIF is no evidence that it is right.
-    kept = component.evidence.model_dump(include={"focal_off", "focal_certainty"})
-    evidence = found.evidence.model_copy(update=kept)
+    evidence = found.evidence.model_copy(update={"focal_off": component.evidence.focal_off})
     return Component(found.model, evidence, capture.verdict(evidence)), decisions
 
 

@@ -83,9 +83,20 @@ def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
     Args:
         colors: Image id -> (F, 3) uint8 RGB of its keypoints.
     """
-    for point in model.points3D.values():
-        seen = [colors[e.image_id][e.point2D_idx] for e in point.track.elements]
-        point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
+    points = list(model.points3D.values())
+    tracks = [point.track.elements for point in points]
+    # Integer sums are exact, in any order.
+    sums = np.zeros((len(points), 3), np.int64)
+    of_image: dict[int, tuple[list[int], list[int]]] = {}
+    for index, track in enumerate(tracks):
+        for element in track:
+            rows, keypoints = of_image.setdefault(element.image_id, ([], []))
+            rows.append(index)
+            keypoints.append(element.point2D_idx)
+    for image_id, (rows, keypoints) in of_image.items():
+        np.add.at(sums, rows, colors[image_id][keypoints].astype(np.int64))
+    for point, total, track in zip(points, sums, tracks, strict=True):
+        point.color = np.rint(total / len(track)).astype(np.uint8)
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:

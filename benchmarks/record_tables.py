@@ -22,6 +22,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LightResult,
     MemoryResult,
     NovelViewResult,
     PoseOutcome,
@@ -70,6 +71,27 @@ def novel_views(found: Sequence[NovelViewResult]) -> str:
         shares = (f"{100 * share:.2f}" for share in (r.contradicted_share, r.unseen_share))
         agreement = (cell(r.psnr, ".2f"), cell(r.ssim, ".4f"))
         rows.append([r.run, str(r.views), r.kind, *shares, r.against or "-", *agreement])
+    return markdown.table(rows)
+
+
+def light(found: Sequence[LightResult]) -> str:
+    """One row for each run; differences are from the plain world's run of the same setup."""
+    rows = [
+        [
+            *("world", "seed", "pixels", "steps", "appearance", "PSNR (dB)", "right half (dB)"),
+            *("from plain (dB)", "without gains or fit (dB)", "withheld (dB)", "time (s)"),
+        ]
+    ]
+    plain = {
+        (r.seed, r.pixels, r.views, r.steps): r.psnr_right for r in found if r.world == "plain"
+    }
+    for r in found:
+        reference = plain.get((r.seed, r.pixels, r.views, r.steps))
+        difference = None if reference is None else r.psnr_right - reference
+        chosen = r.chosen if r.option == "measured" else f"{r.chosen} (given)"
+        values = (f"{r.psnr:.2f}", f"{r.psnr_right:.2f}", cell(difference, "+.2f"))
+        others = (f"{r.psnr_own:.2f}", cell(r.psnr_withheld, ".2f"), f"{r.seconds:.0f}")
+        rows.append([r.world, str(r.seed), r.pixels, str(r.steps), chosen, *values, *others])
     return markdown.table(rows)
 
 
@@ -244,6 +266,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "budgets": (BudgetResult, budget_tables.table),
     "budget-curves": (BudgetResult, budget_tables.curves),
     "novel_views": (NovelViewResult, novel_views),
+    "light": (LightResult, light),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

@@ -352,6 +352,42 @@ class BudgetResult:
     flip: float | None = None
 
 
+# ---- benchmarks.light ----
+
+
+@dataclass(frozen=True)
+class LightResult:
+    """A world of ``benchmarks.light``, trained and measured on test views in reference conditions.
+
+    Attributes:
+        views: The number of photographs.
+        pixels: The size of the photographs.
+        option: The option ``train.appearance``.
+        chosen: The model of appearance that was used: "none", "exposure" or "embedding".
+        gaussians: The number of Gaussians.
+        psnr: The mean over the test views by the stated protocol: with gains, or with the
+            appearance fitted on the left half and measured on the right half.
+        psnr_right: The same on the right halves, for any model of appearance.
+        psnr_own: The mean without gains or fit.
+        psnr_withheld: The mean over the withheld views, without gains or fit; None without any.
+        seconds: The time of training.
+    """
+
+    world: str
+    seed: int
+    views: int
+    pixels: str
+    steps: int
+    option: str
+    chosen: str
+    gaussians: int
+    psnr: float
+    psnr_right: float
+    psnr_own: float
+    psnr_withheld: float | None
+    seconds: float
+
+
 # ---- benchmarks.pose_conventions ----
 
 PoseOutcome = Literal["agree", "named", "refused", "warned", "silent"]

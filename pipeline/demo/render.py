@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.demo.lighting import REFERENCE_LIGHT, Light
 from pipeline.demo.scene import BACKGROUND, SceneObject, shade, trace
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
@@ -45,10 +46,10 @@ class Rendered:
 
     Attributes:
         light: (H, W, 3) float64 linear RGB, multiplied by alpha if ``transparent``.
-        coverage: (H, W) float64 shares of the pixels covered by the visitor, the last object of the
-            scene (``visitor``), or by any object (``transparent``); else 1.
+        coverage: (H, W) float64 shares of the pixels covered by visitors, or by any object
+            (``transparent``); 1 without both.
         depth: (H, W) float32 z of the scene's surface at the pixel centre, or its distance for a
-            wide lens, ignoring the visitor; 0 if there is no surface.
+            wide lens, ignoring visitors; 0 if there is no surface.
     """
 
     light: Array
@@ -77,15 +78,19 @@ def render(
     objects: tuple[SceneObject, ...],
     *,
     transparent: bool = False,
-    visitor: bool = False,
+    visitors: int = 0,
+    lit: Light = REFERENCE_LIGHT,
 ) -> Rendered:
     """Render one view.
 
     Args:
         through: The rays of the camera (``rays(camera)``).
         transparent: Whether to leave out the room. Coverage is then the objects' alpha.
-        visitor: Whether the last object does not belong to the scene. Coverage is then its share.
+        visitors: The number of last objects that do not belong to the scene. If there are any,
+            coverage is their share.
+        lit: The light of the scene.
     """
+    scene = objects[: len(objects) - visitors]
     rows, columns = through.fine.shape[1:]
     flat = through.fine.reshape(3, -1)
     layers = np.empty((4, flat.shape[1]))
@@ -95,12 +100,12 @@ def render(
         seen = np.isfinite(flat[0, part])
         origin, direction = _world(posed, _or_forward(flat[:, part]))
         t, index = trace(origin, direction, objects)
-        light = shade(origin, direction, t, index, pixel * t, objects)
+        light = shade(origin, direction, t, index, pixel * t, objects, lit)
         if transparent:
             inside = index != BACKGROUND
             light *= inside
         else:
-            inside = index == len(objects) - 1 if visitor else np.ones(index.shape, bool)
+            inside = index >= len(scene) if visitors else np.ones(index.shape, bool)
         light = np.where(seen, light, 0.0)
         layers[:3, part], layers[3, part] = light, inside
     picture = np.ascontiguousarray(layers.reshape(4, rows, columns).transpose(1, 2, 0))
@@ -108,7 +113,7 @@ def render(
 
     centres = through.centres.reshape(3, -1)
     origin, direction = _world(posed, _or_forward(centres))
-    t, index = trace(origin, direction, objects[:-1] if visitor else objects)
+    t, index = trace(origin, direction, scene)
     nothing = ((index == BACKGROUND) & transparent) | ~np.isfinite(centres[0])
     depth = np.where(nothing, 0.0, t).astype(np.float32)
     return Rendered(picture[..., :3], picture[..., 3], depth.reshape(camera.height, camera.width))

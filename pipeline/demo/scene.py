@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.demo.lighting import Colour, Light
 from pipeline.demo.shapes import Box, Cylinder, Shape, Sphere
 from pipeline.demo.textures import Material
 
@@ -18,9 +19,7 @@ Array = NDArray[np.float64]
 
 ROOM = Box((0, 0, 1.5), (3.5, 3.5, 1.5), inside=True)
 LAMPS = np.array([[1.2, -0.9, 2.8], [-1.6, 1.2, 2.6]])
-LAMP_POWER = (0.75, 0.35)
 LAMP_SIZE = 0.5  # Half the side of each lamp's panel; larger panels give softer shadows.
-AMBIENT = 0.5
 LAMP_SAMPLES = 6  # Samples per side of the grid over a panel.
 SKY_SAMPLES = 48
 # Shadows come from a precomputed map of the middle of the floor; outside it there are none.
@@ -110,8 +109,9 @@ def shade(
     index: NDArray,
     blur: Array,
     objects: tuple[SceneObject, ...],
+    lit: Light,
 ) -> Array:
-    """(3, N) linear radiance along rays with hits at ``t``.
+    """(3, N) linear radiance along rays with hits at ``t``, in the light ``lit``.
 
     Args:
         blur: (N,) sigmas of the texture filter at the hits in metres.
@@ -124,15 +124,15 @@ def shade(
             continue
         p, s = point[:, here], blur[here]
         if i == BACKGROUND:
-            light[:, here] = _room_light(p, s)
+            light[:, here] = _room_light(p, s, lit)
             continue
         normal = objects[i].shape.normal(p)
         material = objects[i].material
         # Near the floor, a part of the ambient light is occluded.
         open_share = 0.72 + 0.28 * np.clip(p[2] / 0.25, 0, 1)
-        colour = _albedo(material, p, s) * _irradiance(p, normal) * open_share
+        colour = _albedo(material, p, s) * _irradiance(p, normal, lit) * open_share
         if material.gloss > 0:
-            colour = 0.9 * colour + _reflection(material, direction[:, here], p, normal)
+            colour = 0.9 * colour + _reflection(material, direction[:, here], p, normal, lit)
         light[:, here] = colour
     return light
 
@@ -141,22 +141,39 @@ def _albedo(material: Material, point: Array, blur: Array) -> Array:
     return material.albedo(point.astype(np.float32), blur.astype(np.float32)).astype(np.float64)
 
 
-def _irradiance(point: Array, normal: Array) -> Array:
-    """The light on a matte surface without shadows: from the sky of the room and the lamps."""
-    total = AMBIENT * (0.8 + 0.2 * normal[2])
-    for lamp, power in zip(LAMPS, LAMP_POWER, strict=True):
+def _irradiance(point: Array, normal: Array, lit: Light) -> Array:
+    """(3, N) light on a matte surface: without shadows but those of the sun."""
+    total = _column(lit.sky) * (0.8 + 0.2 * normal[2])
+    for lamp, power in zip(LAMPS, lit.lamps, strict=True):
         total = total + _lamp_light(lamp, power, point, normal)
-    return np.asarray(total)
+    return _with_sun_and_clouds(total, point, normal, lit)
 
 
-def _lamp_light(lamp: Array, power: float, point: Array, normal: Array) -> Array:
+def _lamp_light(lamp: Array, power: Colour, point: Array, normal: Array) -> Array:
     to_lamp = lamp[:, None] - point
     distance2 = (to_lamp**2).sum(0)
     cosine = np.maximum((to_lamp * normal).sum(0), 0) / np.sqrt(distance2)
-    return np.asarray(power * cosine / (0.5 + 0.12 * distance2))
+    return np.asarray(_column(power) * cosine / (0.5 + 0.12 * distance2))
 
 
-def _room_light(point: Array, blur: Array) -> Array:
+def _with_sun_and_clouds(total: Array, point: Array, normal: Array, lit: Light) -> Array:
+    """(3, N) light with that of the sun, whose shadows are those of the objects, dimmed by
+    clouds."""
+    if lit.sun is not None:
+        towards = _column(lit.towards_sun)
+        faces = np.flatnonzero((towards * normal).sum(0) > 0)
+        cosine = np.zeros(point.shape[1])
+        cosine[faces] = (towards * normal[:, faces]).sum(0)
+        cosine[faces] *= _is_open(point[:, faces], towards + 0 * point[:, faces])
+        total = total + _column(lit.sun) * cosine
+    return total if lit.clouds is None else total * lit.clouds.share(point)
+
+
+def _column(colour: Colour) -> Array:
+    return np.array(colour)[:, None]
+
+
+def _room_light(point: Array, blur: Array, lit: Light) -> Array:
     normal = ROOM.normal(point)
     light = np.zeros(point.shape)
     floor, ceiling = normal[2] > 0.5, normal[2] < -0.5
@@ -167,28 +184,34 @@ def _room_light(point: Array, blur: Array) -> Array:
     ):
         here = np.flatnonzero(where)
         p = point[:, here]
-        irradiance = _floor_irradiance(p) if material is FLOOR else _irradiance(p, normal[:, here])
+        if material is FLOOR:
+            irradiance = _floor_irradiance(p, lit)
+        else:
+            irradiance = _irradiance(p, normal[:, here], lit)
         light[:, here] = _albedo(material, p, blur[here]) * irradiance
     return light
 
 
-def _reflection(material: Material, direction: Array, point: Array, normal: Array) -> Array:
+def _reflection(
+    material: Material, direction: Array, point: Array, normal: Array, lit: Light
+) -> Array:
     """Mild gloss: the room as a blurred mirror (Schlick's Fresnel) and the lamps' highlights."""
     view = direction / np.linalg.norm(direction, axis=0)
     cosine = -(view * normal).sum(0)
     mirrored = view + 2 * cosine * normal
     fresnel = material.gloss + (0.5 - material.gloss) * (1 - np.clip(cosine, 0, 1)) ** 5
     t = ROOM.hit(point, mirrored)
-    light = fresnel * _room_light(point + t * mirrored, np.full(t.shape, 0.2))
-    for lamp, power in zip(LAMPS, LAMP_POWER, strict=True):
+    light = fresnel * _room_light(point + t * mirrored, np.full(t.shape, 0.2), lit)
+    for lamp, power in zip(LAMPS, lit.lamps, strict=True):
         to_lamp = lamp[:, None] - point
         to_lamp = to_lamp / np.linalg.norm(to_lamp, axis=0)
-        light = light + 0.6 * power * np.maximum((to_lamp * mirrored).sum(0), 0) ** 30
+        light = light + 0.6 * _column(power) * np.maximum((to_lamp * mirrored).sum(0), 0) ** 30
     return np.asarray(light)
 
 
-def _floor_irradiance(point: Array) -> Array:
-    """The light on (3, N) points of the floor as in ``_irradiance``, with soft shadows."""
+def _floor_irradiance(point: Array, lit: Light) -> Array:
+    """The light on (3, N) points of the floor as in ``_irradiance``, with the soft shadows of the
+    lamps and the sky."""
     scale = (SHADOW_CELLS - 1) / 2
     u = np.clip((point[0] / SHADOW_REACH + 1) * scale, 0, SHADOW_CELLS - 1.001)
     v = np.clip((point[1] / SHADOW_REACH + 1) * scale, 0, SHADOW_CELLS - 1.001)
@@ -198,10 +221,10 @@ def _floor_irradiance(point: Array) -> Array:
     top = maps[:, j, i] * (1 - a) + maps[:, j, i + 1] * a
     bottom = maps[:, j + 1, i] * (1 - a) + maps[:, j + 1, i + 1] * a
     sky, *seen = top * (1 - b) + bottom * b
-    total = AMBIENT * sky
-    for lamp, power, share in zip(LAMPS, LAMP_POWER, seen, strict=True):
+    total = _column(lit.sky) * sky
+    for lamp, power, share in zip(LAMPS, lit.lamps, seen, strict=True):
         total = total + share * _lamp_light(lamp, power, point, UP)
-    return np.asarray(total)
+    return _with_sun_and_clouds(total, point, UP + 0 * point, lit)
 
 
 @cache

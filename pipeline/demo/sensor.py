@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 
 MAKE, MODEL = "Splatmake", "Demo 1"
 JPEG_QUALITY = 95
+EXPOSURE_TIME, F_NUMBER, ISO = 1 / 60, 5.6, 100
 
 # The matrix from XYZ (D65) to sensor colours: ColorMatrix in DNG files of the Canon EOS 6D.
 COLOR_MATRIX = np.array(
@@ -46,8 +48,25 @@ def to_bytes(values: Array) -> NDArray[np.uint8]:
     return np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
 
 
+@dataclass(frozen=True)
+class CameraBody:
+    """The camera of a photograph as EXIF names it.
+
+    Attributes:
+        model: The name of the body.
+        exposure_time: The exposure in seconds; None without exposure in EXIF.
+    """
+
+    model: str = MODEL
+    exposure_time: float | None = None
+
+
 def write_picture(
-    path: Path, pixels: NDArray[np.uint8], taken: str, distortion: str = "none"
+    path: Path,
+    pixels: NDArray[np.uint8],
+    taken: str,
+    distortion: str = "none",
+    body: CameraBody = CameraBody(),
 ) -> None:
     """Write (H, W, 3 or 4) sRGB pixels as JPEG or PNG, by the name, with EXIF of the lens.
 
@@ -56,11 +75,14 @@ def write_picture(
     Args:
         taken: The EXIF time, "YYYY:MM:DD hh:mm:ss".
         distortion: A key of ``LENSES``.
+        body: The camera.
     """
     exif = Image.Exif()
-    exif[271], exif[272], exif[274], exif[306] = MAKE, MODEL, 1, taken
+    exif[271], exif[272], exif[274], exif[306] = MAKE, body.model, 1, taken
     photo = exif.get_ifd(0x8769)
     photo[36867] = taken
+    if body.exposure_time is not None:
+        photo[33434], photo[33437], photo[34855] = body.exposure_time, F_NUMBER, ISO
     options: dict[str, Any] = {}
     if distortion == "equirectangular":
         options["xmp"] = GPANO
@@ -118,7 +140,7 @@ def write_dng(path: Path, mosaic: NDArray[np.uint16], taken: str) -> None:
         (33422, "B", 4, tuple(c for row in RGGB for c in row), True),  # CFAPattern
         (33434, "2I", 1, (1, 60), True),  # ExposureTime
         (33437, "2I", 1, (56, 10), True),  # FNumber
-        (34855, "H", 1, 100, True),  # ISO
+        (34855, "H", 1, ISO, True),
         (36867, "s", 0, taken, True),  # DateTimeOriginal
         (37386, "2I", 1, (FOCAL_MM, 1), True),  # FocalLength
         (41486, "2I", 1, rationals(np.array(mosaic.shape[1] / SENSOR_WIDTH_MM * 10)), True),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, get_args
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.demo.cameras import FISHEYE_HALF_ANGLE, LENSES, WIDE, lens, orbit
+from pipeline.demo.capture import Conditions, Shot, photographed, shots, withheld
 from pipeline.demo.output import (
     Poses,
     in_processes,
@@ -22,8 +23,18 @@ from pipeline.demo.output import (
 )
 from pipeline.demo.render import Rays, rays, render
 from pipeline.demo.scene import OBJECTS, VISITOR, SceneObject
-from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
+from pipeline.demo.sensor import (
+    EXPOSURE_TIME,
+    MODEL,
+    CameraBody,
+    expose,
+    srgb,
+    to_bytes,
+    write_dng,
+    write_picture,
+)
 from pipeline.demo.shapes import Sphere
+from pipeline.demo.walkers import walkers
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.runtime.atomic import write_json
@@ -33,6 +44,7 @@ from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
+WITHHELD = "withheld"
 Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # The depth and colours of a view.
 
 
@@ -50,7 +62,8 @@ class DemoSpec:
         alpha: Whether the photographs are PNG with the objects alone on a transparent ground.
         masks: Whether the photographs show a moving ball, which masks/ leave out.
         noise: The read noise of RAW files in steps of 14 bits.
-        seed: The seed of the camera positions, the points, the noise and the ball.
+        seed: The seed of everything random.
+        conditions: What differs between the photographs.
     """
 
     views: int = 32
@@ -64,6 +77,7 @@ class DemoSpec:
     masks: bool = False
     noise: float = 0.0
     seed: int = 0
+    conditions: Conditions = field(default_factory=Conditions)
 
     def check(self) -> None:
         """Raises UserError if options are incompatible."""
@@ -85,6 +99,13 @@ class DemoSpec:
             raise UserError("alpha and masks do not go together", fix="Choose one.")
         if self.format == "dng" and (self.width % 2 or self.height % 2):
             raise UserError("a Bayer mosaic has even sides", fix="Choose an even --size.")
+        self.conditions.check()
+        plain = self.format != "dng" and not (self.alpha or self.masks)
+        if self.conditions != Conditions() and (self.distortion in WIDE or not plain):
+            raise UserError(
+                "photographs differ only as JPEG or PNG without alpha, masks and wide lenses",
+                fix="Leave out --alpha, --masks, --format dng and wide lenses.",
+            )
 
 
 def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
@@ -92,7 +113,8 @@ def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
 
     Inside ``folder``: ``images/``; ``sparse_gt/`` (COLMAP text, the exact cameras of the stored
     pixels); ``depth_gt/*.npy`` (float32 z at pixel centres, 0 where there is nothing);
-    ``masks/``, ``sparse/0`` or ``transforms.json`` if asked for; ``demo.json`` (the spec).
+    ``masks/``, ``sparse/0`` or ``transforms.json`` if asked for; ``demo.json`` (the spec). Withheld
+    photographs are in ``withheld/``, with ``images/``, ``sparse_gt/`` and ``depth_gt/``.
 
     Args:
         processes: The number of views rendered at once; None for one per core.
@@ -102,7 +124,10 @@ def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
     """
     spec.check()
     with new_scene(folder, "demo.json", "demo scene") as work:
-        for name in ("images", "depth_gt", *(["masks"] if spec.masks else [])):
+        folders = ["images", "depth_gt", *(["masks"] if spec.masks else [])]
+        if _withheld(spec):
+            folders += [f"{WITHHELD}/{name}" for name in folders]
+        for name in folders:
             (work / name).mkdir(parents=True)
         _write(work, spec, processes or usable_cores())
 
@@ -116,15 +141,26 @@ def _write(folder: Path, spec: DemoSpec, processes: int) -> None:
             depths.append(depth)
             colours.append(colour)
             progress.advance()
-    truth = Reconstruction({1: camera}, {i + 1: posed for i, posed in enumerate(views)})
+    arc = _withheld(spec)
+    kept = [number for number in range(spec.views) if number not in arc]
+    posed = [views[number] for number in kept]
+    depths, colours = [depths[number] for number in kept], [colours[number] for number in kept]
+    truth = _model(camera, posed)
     write_model(folder / "sparse_gt", truth, text=True)
+    if arc:
+        hidden = _model(camera, [views[number] for number in arc])
+        write_model(folder / WITHHELD / "sparse_gt", hidden, text=True)
     if spec.poses == "colmap":
         points = _points(truth, depths, colours, spec.seed) if spec.points else Points.empty()
         given = Reconstruction(truth.cameras, truth.images, points)
         write_model(folder / "sparse" / "0", given)
     if spec.poses == "transforms":
-        write_json(folder / "transforms.json", transforms(camera, views))
+        write_json(folder / "transforms.json", transforms(camera, posed))
     write_json(folder / "demo.json", asdict(spec))
+
+
+def _model(camera: Camera, views: list[PosedImage]) -> Reconstruction:
+    return Reconstruction({1: camera}, {i + 1: posed for i, posed in enumerate(views)})
 
 
 def _camera(spec: DemoSpec) -> Camera:
@@ -133,6 +169,15 @@ def _camera(spec: DemoSpec) -> Camera:
 
 def _views(spec: DemoSpec) -> list[PosedImage]:
     return orbit([f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed)
+
+
+def _withheld(spec: DemoSpec) -> range:
+    return withheld(spec.conditions, spec.views, spec.seed)
+
+
+@lru_cache(maxsize=1)
+def _shots(spec: DemoSpec) -> list[Shot]:
+    return shots(spec.conditions, spec.views, spec.seed)
 
 
 @lru_cache(maxsize=1)
@@ -144,33 +189,55 @@ def _rays(spec: DemoSpec) -> Rays:
 
 def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
     """Render and write one view, and return its depth and colours for the points. The depth is 0 in
-    pixels of the visitor or without a surface."""
-    camera, posed = _camera(spec), _views(spec)[number]
-    objects = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
-    options = {"transparent": spec.alpha, "visitor": spec.masks}
-    seen = render(posed, camera, _rays(spec), objects, **options)
+    pixels of visitors or without a surface."""
+    camera, posed, shot = _camera(spec), _views(spec)[number], _shots(spec)[number]
+    visitors: tuple[SceneObject, ...] = ()
+    if spec.masks:
+        visitors = (_visitor(spec.seed, number, posed),)
+    elif shot.walkers:
+        visitors = walkers(posed, _rays(spec), spec.seed, number)
+    seen = render(
+        posed,
+        camera,
+        _rays(spec),
+        (*OBJECTS, *visitors),
+        transparent=spec.alpha,
+        visitors=len(visitors),
+        lit=shot.lit,
+    )
     stem = Path(posed.name).stem
+    if number in _withheld(spec):
+        folder = folder / WITHHELD
     path = folder / "images" / posed.name
     taken = f"2026:01:01 12:{number // 60 % 60:02d}:{number % 60:02d}"
-    colour = to_bytes(srgb(seen.light))
+    light = seen.light if shot == Shot() else photographed(seen.light, shot, camera)
+    colour = to_bytes(srgb(light))
     if spec.format == "dng":
-        write_dng(path, expose(seen.light, spec.noise, (spec.seed, number)), taken)
+        write_dng(path, expose(light, spec.noise, (spec.seed, number)), taken)
     elif spec.alpha:
-        straight = seen.light / np.maximum(seen.coverage, 1e-6)[..., None]
+        straight = light / np.maximum(seen.coverage, 1e-6)[..., None]
         alpha = to_bytes(seen.coverage)
         colour = to_bytes(srgb(straight)) * (alpha > 0)[..., None]
         write_picture(path, np.dstack([colour, alpha]), taken)
     else:
-        write_picture(path, colour, taken, spec.distortion)
+        write_picture(path, colour, taken, spec.distortion, _body(shot))
     np.save(folder / "depth_gt" / f"{stem}.npy", seen.depth)
     depth = seen.depth
-    if spec.masks:
+    if visitors:
         visited = seen.coverage > 1e-3
-        Image.fromarray(np.where(visited, 0, 255).astype(np.uint8)).save(
-            folder / "masks" / f"{stem}.png"
-        )
         depth = np.where(visited, np.float32(0), depth)
+        if spec.masks:
+            Image.fromarray(np.where(visited, 0, 255).astype(np.uint8)).save(
+                folder / "masks" / f"{stem}.png"
+            )
     return depth, colour
+
+
+def _body(shot: Shot) -> CameraBody:
+    """The camera body of a photograph. Lenses have bodies of their own."""
+    model = MODEL if shot.body == 0 else f"Demo {shot.body + 1}"
+    exposure = EXPOSURE_TIME * 2**shot.stops if shot.records_exposure else None
+    return CameraBody(model, exposure)
 
 
 def _visitor(seed: int, number: int, posed: PosedImage) -> SceneObject:

@@ -188,7 +188,9 @@ class Inventory:
             return "names"
         if is_pose_file:
             return "poses"
-        if path.as_posix() in _SPECS or (path.parts[0] == "depth_gt" and suffix in DEPTHS.suffixes):
+        if path.as_posix() in _SPECS or path.parts[0] == "withheld":
+            return None
+        if path.parts[0] == "depth_gt" and suffix in DEPTHS.suffixes:
             return None
         if _MODEL.fullmatch(name):
             own = self.poses is not None and path.parent.as_posix() == self.poses.path

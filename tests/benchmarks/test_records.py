@@ -18,6 +18,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LightResult,
     MemoryResult,
     NovelViewResult,
     PoseResult,
@@ -79,6 +80,13 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "novel_views": (
         NovelViewResult("fox", "fox@seed1", "beside", 6, 0.0123, 0.25, 28.125, 0.9),
         "| fox | 6 | beside | 1.23 | 25.00 | fox@seed1 | 28.12 | 0.9000 |",
+    ),
+    "light": (
+        LightResult(
+            *("plain", 0, 48, "240x180", 1500, "measured", "none", 9000),
+            *(30.0, 29.5, 30.0, None, 61.2),
+        ),
+        "| plain | 0 | 240x180 | 1500 | none | 30.00 | 29.50 | +0.00 | 30.00 | - | 61 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

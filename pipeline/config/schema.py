@@ -299,6 +299,13 @@ class Train(Section):
         "the left. measured: embedding if photographs disagree on colours after exposure, else "
         "exposure if exposures differ by more than 0.2 stops (standard deviation).",
     )
+    transients: Literal["auto", "find", "none"] = Field(
+        "auto",
+        description="What only one or few photographs show, such as people who pass by. find: "
+        "where the other photographs contradict a photograph, its pixels are left out of the loss, "
+        "in runs of at least 30 epochs on at least 8 views without alpha. auto: find, but none for "
+        "photographs with masks, in blocks, and with strategy: original. none: all are used.",
+    )
     refine_poses: bool = Field(
         False,
         description="Refine the poses during training, for given poses that are inaccurate. Test "

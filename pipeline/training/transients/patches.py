@@ -1,0 +1,62 @@
+"""The patches of a view that the other views contradict."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pipeline.training.transients.evidence import Expected, Floats
+
+Mask = NDArray[np.bool_]
+
+#: A patch has a core with residuals above the first number, and above the second times what the
+#: other views have on the surface; its other pixels have residuals above those of ``WEAK``.
+STRONG, WEAK = (0.1, 4.0), (0.05, 2.5)
+#: The other views' residual is taken to be at least this, the noise of photographs.
+FLOOR = 0.01
+#: The share of a pixel's weight that several views must show.
+MIN_SUPPORT = 0.5
+#: The smallest patch, and its smallest core, shares of a view.
+MIN_PATCH, MIN_CORE = 1e-3, 3e-4
+#: A view with more in patches differs in light or pose: nothing in it is taken as transient.
+MAX_SHARE = 0.4
+#: A patch must have been found before in this share of its pixels.
+MIN_AGREEMENT = 0.5
+#: Pixels of the reduced images that patches are widened by: their borders have small residuals.
+MARGIN = 2
+
+_EIGHT = np.ones((3, 3), bool)
+
+
+def contradicted(residual: Floats, others: Expected) -> Mask:
+    """(H, W) bool, the patches with a much larger residual than the other views have."""
+    usual = np.maximum(others.residual, FLOOR)
+    evidence = others.support > MIN_SUPPORT
+    core, weak = (
+        evidence & (residual > least) & (residual > ratio * usual)
+        for least, ratio in (STRONG, WEAK)
+    )
+    labels, count = ndimage.label(weak, _EIGHT)
+    sizes, cores = (
+        np.bincount(labels[where], minlength=count + 1) for where in (weak, core & weak)
+    )
+    kept = (sizes >= MIN_PATCH * weak.size) & (cores >= MIN_CORE * weak.size)
+    found = kept[labels] & weak
+    return found if found.mean() <= MAX_SHARE else np.zeros_like(found)
+
+
+def confirmed(found: Mask, before: Mask) -> Mask:
+    """The patches of ``found`` that were found ``before`` as well."""
+    labels, count = ndimage.label(found, _EIGHT)
+    sizes, again = (
+        np.bincount(labels[where], minlength=count + 1) for where in (found, found & before)
+    )
+    return np.asarray((again >= MIN_AGREEMENT * np.maximum(sizes, 1))[labels] & found)
+
+
+def widened(found: Mask) -> Mask:
+    """The patches without holes, and a margin around them."""
+    return np.asarray(
+        ndimage.binary_dilation(ndimage.binary_fill_holes(found), _EIGHT, iterations=MARGIN)
+    )

@@ -384,6 +384,7 @@ ExportFormat = Literal[
     "transforms",
     "dense_points",
     "dense_maps",
+    "masks",
     "renders",
     "depths",
     "mesh",
@@ -394,6 +395,8 @@ ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), Afte
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
+# The format that needs the photographs before undistortion.
+MASKS_FORMAT: ExportFormat = "masks"
 # The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -409,7 +412,8 @@ class Export(Section):
         "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
-        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Rendered from "
+        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
+        "train.transients left out, as masks of the photographs (PNG). Rendered from "
         "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
         "path).",
     )

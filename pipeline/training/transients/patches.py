@@ -29,6 +29,11 @@ MARGIN = 2
 _EIGHT = np.ones((3, 3), bool)
 
 
+def has_core(residual: Floats) -> bool:
+    """Whether residuals (H, W) are large enough for the core of a patch."""
+    return int((residual > STRONG[0]).sum()) >= MIN_CORE * residual.size
+
+
 def contradicted(residual: Floats, others: Expected) -> Mask:
     """(H, W) bool, the patches with a much larger residual than the other views have."""
     usual = np.maximum(others.residual, FLOOR)

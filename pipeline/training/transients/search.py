@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.photos.found_masks import enlarged
 from pipeline.scene.views import View, reduced_size
 from pipeline.training.data.targets import Target
 from pipeline.training.transients.evidence import (
@@ -20,10 +21,11 @@ from pipeline.training.transients.evidence import (
     gather,
     weights_of,
 )
-from pipeline.training.transients.patches import Mask, confirmed, contradicted, widened
+from pipeline.training.transients.patches import Mask, confirmed, contradicted, has_core, widened
 
-#: The search is repeated after these shares of a run. What the first one finds is only remembered.
-RUN_SHARES = 0.2, 0.3, 0.5, 0.7
+#: Transients are searched for after these shares of a run. What the first search finds is only
+#: remembered.
+RUN_SHARES = 0.12, 0.2, 0.5
 #: Fewer views do not show which of them is wrong. Runs of fewer epochs would spend too large a part
 #: of their time on the search.
 MIN_VIEWS, MIN_EPOCHS = 8, 30
@@ -79,6 +81,8 @@ class Transients:
         evidence = gather(photographs)
         found = [
             contradicted(residual, expected(photographs, evidence, index))
+            if has_core(residual)
+            else np.zeros(residual.shape, bool)
             for index, residual in enumerate(evidence.residuals)
         ]
         masks = [confirmed(now, before) for now, before in zip(found, self.found, strict=True)]
@@ -141,13 +145,6 @@ def explaining(
             rendered = photographs.render(index)
             hidden += weights_of(rendered, (image, image), photographs.backend)[0]
     return (hidden > HIDDEN_SHARE * evidence.weight) & (hidden > MIN_HIDDEN)
-
-
-def enlarged(mask: Mask, width: int, height: int) -> Mask:
-    """The mask at another size, by nearest neighbour."""
-    rows = ((np.arange(height) + 0.5) * (mask.shape[0] / height)).astype(np.intp)
-    columns = ((np.arange(width) + 0.5) * (mask.shape[1] / width)).astype(np.intp)
-    return mask[rows[:, None], columns]
 
 
 def _packed(masks: Sequence[Mask]) -> NDArray[np.uint8]:

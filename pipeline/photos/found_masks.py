@@ -54,16 +54,13 @@ def write_found(folder: Path, transients: Mapping[str, Mask]) -> None:
         write_picture(folder / mask_file(name), np.where(mask, 0, 255).astype(np.uint8))
 
 
-def write_photo_masks(out: Path, found: Path, views: PosedPhotos, photos: PosedPhotos) -> int:
+def write_photo_masks(out: Path, found: Path, views: PosedPhotos, photos: PosedPhotos) -> None:
     """Write the masks in the folder ``found`` as masks of the photographs, at their stored size,
-    united with the masks that the photographs have.
+    united with the masks that the photographs have. Without any in ``found``, none is written.
 
     Args:
         views: The undistorted views, or those that wide photographs were split into.
         photos: The photographs, in the same world.
-
-    Returns:
-        The number of photographs in whose views something was found.
     """
     originals = _originals(views.manifest, photos.manifest)
     posed, sources = views.model.by_name(), photos.model.by_name()
@@ -83,7 +80,6 @@ def write_photo_masks(out: Path, found: Path, views: PosedPhotos, photos: PosedP
             used = seen if used is None else seen & enlarged(used, photo.width, photo.height)
         if parts and used is not None:
             write_picture(out / names[photo.name], used.astype(np.uint8) * 255)
-    return len(parts)
 
 
 def enlarged(mask: Mask, width: int, height: int) -> Mask:

@@ -18,7 +18,7 @@ FLOOR = 0.01
 #: The share of a pixel's weight that several views must show.
 MIN_SUPPORT = 0.5
 #: The smallest patch, and its smallest core, shares of a view.
-MIN_PATCH, MIN_CORE = 1e-3, 3e-4
+MIN_PATCH, MIN_CORE = 4e-3, 1e-3
 #: A view with more in patches differs in light or pose: nothing in it is taken as transient.
 MAX_SHARE = 0.4
 #: A patch must have been found before in this share of its pixels.

@@ -74,12 +74,14 @@ def error(result: TrainResult, scene: TinyScene) -> float:
 def test_a_person_in_one_view_is_left_out_of_the_loss(crowd, tmp_path: Path) -> None:
     scene, views = crowd
     result = trained(crowd, tmp_path / "find", "find")
-    assert result.transients is not None and list(result.transients) == ["3.png"]
+    assert result.transients is not None and "3.png" in result.transients
     mask = result.transients["3.png"]
+    assert sum(int(other.sum()) for other in result.transients.values()) < 1.5 * mask.sum()
     assert mask.shape == (views[3].height, views[3].width)
     assert mask[PERSON].mean() > 0.9 and mask.sum() < 3 * mask[PERSON].size
     [line] = transients_lines(result, views)
-    assert line.startswith("passers-by: 1 of 10 views") and "train.transients" in line
+    assert line.startswith("passers-by: ") and "of 10 views" in line
+    assert "left out of the loss (train.transients)" in line
     without = trained(crowd, tmp_path / "none", "none")
     assert without.transients is None
     assert error(result, scene) < 0.5 * error(without, scene)
@@ -91,14 +93,14 @@ def test_a_static_scene_has_the_bits_of_a_run_without_the_search(crowd, tmp_path
     assert_same(found, trained(crowd, tmp_path / "none", "none", crowded=False))
 
 
-@pytest.mark.parametrize("step", [30, 50])
+@pytest.mark.parametrize("step", [20, 50])
 def test_killed_between_searches_and_resumed_gives_the_same_bits(
     crowd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
-    """The searches are after steps 24, 36, 60 and 84; each has a backward pass for each view."""
+    """The searches are after steps 14, 24 and 60; each has a backward pass for each view."""
     whole = trained(crowd, tmp_path / "whole", "find")
     searches = sum(step > round(share * STEPS) for share in search.RUN_SHARES)
-    with killed_in_step(monkeypatch, step + searches * VIEWS + max(0, searches - 1)):
+    with killed_in_step(monkeypatch, step + searches * VIEWS):
         trained(crowd, tmp_path / "cut", "find")
     resumed = trained(crowd, tmp_path / "cut", "find")
     assert_same(whole, resumed)

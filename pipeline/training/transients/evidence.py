@@ -36,6 +36,20 @@ MIN_VIEWS = 3.0
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """A render of a view beside its photograph.
+
+    Attributes:
+        residual: (H, W) r_v, 0 at ignored pixels.
+        rendered, photo: (H, W) float16 mean of the channels, in [0, 1].
+    """
+
+    residual: Floats
+    rendered: NDArray[np.float16]
+    photo: NDArray[np.float16]
+
+
+@dataclass(frozen=True)
 class ReducedPhotographs:
     """The training views at a reduced size.
 
@@ -59,16 +73,20 @@ class ReducedPhotographs:
         parameters = self.shown(index).parameters()
         return self.backend.forward(*parameters, self.cameras[index], self.options)
 
-    def residual(self, index: int, rendered: Forward) -> Floats:
-        """(H, W) smoothed residual of a view, 0 at ignored pixels."""
+    def compare(self, index: int, rendered: Forward) -> Comparison:
+        """Compare the render of a view with its photograph."""
         target, color = self.target(index), rendered.color
         if self.gains is not None:
             color = color * self.gains[index]
-        image = target.rgb.to(torch.float32) / 255.0
-        difference = (color.clamp(0.0, 1.0) - image).abs().mean(2)
+        color, image = color.clamp(0.0, 1.0), target.rgb.to(torch.float32) / 255.0
+        difference = (color - image).abs().mean(2)
         if target.ignored is not None:
             difference = difference.masked_fill(target.ignored, 0.0)
-        return np.asarray(ndimage.gaussian_filter(difference.numpy(), SMOOTHING))
+        return Comparison(
+            np.asarray(ndimage.gaussian_filter(difference.numpy(), SMOOTHING)),
+            color.mean(2).to(torch.float16).numpy(),
+            image.mean(2).to(torch.float16).numpy(),
+        )
 
 
 @dataclass(frozen=True)
@@ -76,16 +94,16 @@ class Evidence:
     """What all views say about the Gaussians.
 
     Attributes:
-        residuals: (H, W) residual of each view.
+        views: Each view.
         weight: (N,) W_i, pixels of the reduced images.
         mean: (N,) m_i.
-        views: (N,) n_i, at least 1.
+        count: (N,) n_i, at least 1.
     """
 
-    residuals: Sequence[Floats]
+    views: Sequence[Comparison]
     weight: Tensor
     mean: Tensor
-    views: Tensor
+    count: Tensor
 
 
 @dataclass(frozen=True)
@@ -104,20 +122,20 @@ class Expected:
 def gather(photographs: ReducedPhotographs) -> Evidence:
     """Render every view once, and sum up residuals for each Gaussian."""
     total = squares = weighted = torch.zeros(0)
-    residuals = []
+    views = []
     for index in range(len(photographs.cameras)):
         rendered = photographs.render(index)
-        residual = photographs.residual(index, rendered)
-        one = np.ones_like(residual)
-        weight, sums = weights_of(rendered, (one, residual), photographs.backend)
+        view = photographs.compare(index, rendered)
+        images = np.ones_like(view.residual), view.residual
+        weight, sums = weights_of(rendered, images, photographs.backend)
         if not len(total):
             total, squares, weighted = (torch.zeros_like(weight) for _ in range(3))
         total += weight
         squares += weight * weight
         weighted += sums
-        residuals.append(residual)
+        views.append(view)
     return Evidence(
-        residuals,
+        views,
         total,
         weighted / total.clamp(min=1e-6),
         (total * total / squares.clamp(min=1e-12)).clamp(min=1.0),
@@ -127,7 +145,7 @@ def gather(photographs: ReducedPhotographs) -> Evidence:
 def expected(photographs: ReducedPhotographs, evidence: Evidence, index: int) -> Expected:
     """What the other views lead to expect of view ``index``."""
     colours = torch.stack(
-        [evidence.mean, 1 / evidence.views, (evidence.views >= MIN_VIEWS).to(torch.float32)], 1
+        [evidence.mean, 1 / evidence.count, (evidence.count >= MIN_VIEWS).to(torch.float32)], 1
     )
     options = replace(photographs.options, sh_degree=0, background=None)
     painted = _painted(photographs.shown(index), colours)
@@ -137,7 +155,7 @@ def expected(photographs: ReducedPhotographs, evidence: Evidence, index: int) ->
     mean, own, support = rendered.color.permute(2, 0, 1).numpy()
     alpha = np.maximum(rendered.alpha.numpy(), 1e-3)
     own = np.minimum(own / alpha, 0.5)
-    others = (mean / alpha - own * evidence.residuals[index]) / (1 - own)
+    others = (mean / alpha - own * evidence.views[index].residual) / (1 - own)
     return Expected(np.maximum(others, 0.0), support)
 
 

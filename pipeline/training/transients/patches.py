@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.training.transients.evidence import Expected, Floats
+from pipeline.training.transients.evidence import Comparison, Expected, Floats
 
 Mask = NDArray[np.bool_]
 
@@ -19,6 +21,9 @@ FLOOR = 0.01
 MIN_SUPPORT = 0.5
 #: The smallest patch, and its smallest core, shares of a view.
 MIN_PATCH, MIN_CORE = 4e-3, 1e-3
+#: In and around a patch, render and photograph have at most this correlation: someone who passes by
+#: has other edges than what is behind.
+MAX_CORRELATION = 0.65
 #: A view with more in patches differs in light or pose: nothing in it is taken as transient.
 MAX_SHARE = 0.4
 #: A patch must have been found before in this share of its pixels.
@@ -34,8 +39,9 @@ def has_core(residual: Floats) -> bool:
     return int((residual > STRONG[0]).sum()) >= MIN_CORE * residual.size
 
 
-def contradicted(residual: Floats, others: Expected) -> Mask:
+def contradicted(view: Comparison, others: Expected) -> Mask:
     """(H, W) bool, the patches with a much larger residual than the other views have."""
+    residual = view.residual
     usual = np.maximum(others.residual, FLOOR)
     evidence = others.support > MIN_SUPPORT
     core, weak = (
@@ -47,8 +53,20 @@ def contradicted(residual: Floats, others: Expected) -> Mask:
         np.bincount(labels[where], minlength=count + 1) for where in (weak, core & weak)
     )
     kept = (sizes >= MIN_PATCH * weak.size) & (cores >= MIN_CORE * weak.size)
+    for label in np.flatnonzero(kept[1:]) + 1:
+        kept[label] = correlation(view, labels == label) < MAX_CORRELATION
     found = kept[labels] & weak
     return found if found.mean() <= MAX_SHARE else np.zeros_like(found)
+
+
+def correlation(view: Comparison, patch: Mask) -> float:
+    """The correlation of render and photograph in a patch and its margin: large if they differ in
+    brightness alone, as in a reflection, or if edges are not sharp yet."""
+    near = _with_margin(patch)
+    rendered, photo = (image[near].astype(np.float64) for image in (view.rendered, view.photo))
+    rendered, photo = rendered - rendered.mean(), photo - photo.mean()
+    variances = float((rendered**2).sum() * (photo**2).sum())
+    return float((rendered * photo).sum()) / math.sqrt(max(variances, 1e-12))
 
 
 def confirmed(found: Mask, before: Mask) -> Mask:
@@ -62,6 +80,8 @@ def confirmed(found: Mask, before: Mask) -> Mask:
 
 def widened(found: Mask) -> Mask:
     """The patches without holes, and a margin around them."""
-    return np.asarray(
-        ndimage.binary_dilation(ndimage.binary_fill_holes(found), _EIGHT, iterations=MARGIN)
-    )
+    return _with_margin(ndimage.binary_fill_holes(found))
+
+
+def _with_margin(found: Mask) -> Mask:
+    return np.asarray(ndimage.binary_dilation(found, _EIGHT, iterations=MARGIN))

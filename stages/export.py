@@ -3,7 +3,7 @@
 Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.splat``, ``.glb``); sparse points
 (``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP; ``transforms.json``);
 ``frame.json`` with axes, unit and up direction. On demand ``dense_points.ply``, ``dense_maps/``,
-``renders/``, ``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
+``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Views
+from pipeline.config.schema import (
+    BLOCKS_FORMAT,
+    DENSE_FORMATS,
+    MASKS_FORMAT,
+    Export,
+    Split,
+    Views,
+)
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel
@@ -21,6 +28,7 @@ from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
+    from pipeline.export.write import FoundMasks
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
@@ -59,6 +67,7 @@ def work(job: Job) -> None:
         folder=job.inputs["train"].parent / job.stage,
         dense=job.inputs.get("dense"),
         partition=Partition.read(folder) if (folder := job.inputs.get("partition")) else None,
+        found=_found_masks(job),
     )
     report = export_scene(
         job.out,
@@ -70,6 +79,21 @@ def work(job: Job) -> None:
         threads=job.threads,
     )
     job.record(report.counters, report.decisions, report.warnings)
+
+
+def _found_masks(job: Job) -> FoundMasks | None:
+    from pipeline.export.write import FoundMasks
+    from pipeline.photos.found_masks import PosedPhotos
+
+    if "photos" not in job.inputs:
+        return None
+    return FoundMasks(
+        job.inputs["train"] / inputs.TRANSIENTS,
+        PosedPhotos(inputs.read_manifest(job, "views"), inputs.input_model(job, points=False)),
+        PosedPhotos(
+            inputs.read_manifest(job, "photos"), inputs.input_model(job, "poses", points=False)
+        ),
+    )
 
 
 def facts(plan: Plan) -> dict[str, Any]:
@@ -86,10 +110,12 @@ SPEC = StageSpec(
     decide=decide,
     counters=ExportCounters,
     inputs=inputs.TRAINED
-    | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)},
+    | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)}
+    | {"photos": inputs.PHOTOS},
     only_if={
         "dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats),
         "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
+        "photos": lambda config: MASKS_FORMAT in config.export.formats,
     },
     optional=("partition",),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),

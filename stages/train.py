@@ -25,6 +25,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         "train.device",
         "train.density.max_gaussians",
         "train.background",
+        "train.transients",
         "train.depth_loss_weight",
     )
     decisions = [

@@ -30,6 +30,7 @@ ROOMS = {
     "training.appearance": "exposure gains and appearance embeddings",
     "training.density": "density strategies, removal of floaters",
     "training.few_views": "drop-out and fewer spherical harmonics for few photographs",
+    "training.transients": "pixels that only one or few photographs show",
     "training.run": "the settings of a training: options, seed, threads, memory",
     "training.checkpoints": "files that resume a killed run",
     "training.loop": "the optimisation, step by step",

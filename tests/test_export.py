@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -25,6 +26,8 @@ from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
 from pipeline.mvs.maps import DenseCloud, DenseMap, write_dense_cloud, write_map
+from pipeline.photos.found_masks import write_found
+from pipeline.photos.load import load_mask
 from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
@@ -36,6 +39,7 @@ from stages.export import work
 from tests.splats.samples import sample
 
 FORMATS = get_args(ExportFormat)
+ROLES = ("views", "model", "poses", "inspect", "photos")
 
 
 @pytest.fixture
@@ -70,6 +74,9 @@ def scene(tmp_path: Path) -> Path:
     up = np.array([[0.0, 0.0, 1.0]], np.float32)
     cloud = DenseCloud(np.array([[0, 1, 2]], np.float32), up, np.array([[1, 2, 3]], np.uint8))
     write_dense_cloud(scene / "dense", cloud)
+    person = np.zeros((60, 90), bool)
+    person[20:40, 30:45] = True
+    write_found(scene / "train" / "transients", {"p3.png": person})
     depth = np.full((60, 90), 2.0, np.float32)
     normals = np.broadcast_to(-up[0], (60, 90, 3)).astype(np.float32)
     for i in range(1, 8):  # p0 and p8 are test views
@@ -88,7 +95,7 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
         stage="export",
         scene="NAME",
         key={"seed": 0, "config": config},
-        inputs={role: scene / "undistort" for role in ("views", "model", "poses", "inspect")}
+        inputs={role: scene / "undistort" for role in ROLES}
         | {
             name: scene / name
             for name in ("train", "dense", "partition")
@@ -128,6 +135,8 @@ def test_every_format_the_schema_offers_is_written(scene):
     assert b"property float nx" in (out / "dense_points.ply").read_bytes()
     maps = sorted(path.name for path in (out / "dense_maps").iterdir())
     assert maps == [f"p{i}.tiff" for i in range(1, 8)]
+    [mask] = (out / "masks").iterdir()
+    assert mask.name == "p3.png" and (~load_mask(str(mask))).sum() == 20 * 15
 
 
 GIVEN = Normalization(0.001, np.array([4e6, 5e5, 300.0]))
@@ -285,6 +294,13 @@ def test_default_formats(scene):
         *("point_cloud.ply", "point_cloud.spz", "points.ply", "transforms.json", "frame.json"),
         *(f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")),
     }
+
+
+def test_masks_that_training_did_not_find_are_no_files(scene):
+    shutil.rmtree(scene / "train" / "transients")
+    out, job = export(scene, formats=["ply", "masks"])
+    assert not (out / "masks").exists()
+    assert "no masks: training left nothing out (train.transients)" in job.decisions
 
 
 def test_pruning_everything_is_an_error(scene):

@@ -299,6 +299,13 @@ class Train(Section):
         "the left. measured: embedding if photographs disagree on colours after exposure, else "
         "exposure if exposures differ by more than 0.2 stops (standard deviation).",
     )
+    transients: Literal["auto", "find", "none"] = Field(
+        "auto",
+        description="What only one or few photographs show, such as people who pass by. find: "
+        "where the other photographs contradict a photograph, its pixels are left out of the loss, "
+        "in runs of at least 30 epochs on at least 8 views without alpha. auto: find, but none for "
+        "photographs with masks, in blocks, and with strategy: original. none: all are used.",
+    )
     refine_poses: bool = Field(
         False,
         description="Refine the poses during training, for given poses that are inaccurate. Test "
@@ -377,6 +384,7 @@ ExportFormat = Literal[
     "transforms",
     "dense_points",
     "dense_maps",
+    "masks",
     "renders",
     "depths",
     "mesh",
@@ -387,6 +395,8 @@ ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), Afte
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
+# The format that needs the photographs before undistortion.
+MASKS_FORMAT: ExportFormat = "masks"
 # The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -402,7 +412,8 @@ class Export(Section):
         "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
-        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Rendered from "
+        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
+        "train.transients left out, as masks of the photographs (PNG). Rendered from "
         "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
         "path).",
     )

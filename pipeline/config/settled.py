@@ -68,6 +68,7 @@ class Train(schema.Train):
     device: Device = "cpu"
     background: Background = "black"
     appearance: Literal["measured", "none", "exposure", "embedding"] = "none"
+    transients: Literal["find", "none"] = "none"
     depth_loss_weight: LossWeight = 0.0
 
 

@@ -23,6 +23,7 @@ from pipeline.io.spz import write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
+from pipeline.photos.found_masks import PosedPhotos, write_photo_masks
 from pipeline.photos.naming import rename
 from pipeline.scene.blocks import Partition
 from pipeline.scene.georeference import Georeference
@@ -40,6 +41,20 @@ GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "splat", "gltf")
 
 
 @dataclass(frozen=True)
+class FoundMasks:
+    """What training left out of its views.
+
+    Attributes:
+        folder: The masks of the views (``photos.found_masks.write_found``).
+        views, photos: The views, and the photographs before undistortion.
+    """
+
+    folder: Path
+    views: PosedPhotos
+    photos: PosedPhotos
+
+
+@dataclass(frozen=True)
 class ExportScene:
     """A finished scene.
 
@@ -54,6 +69,7 @@ class ExportScene:
         folder: The final folder of the exported files.
         dense: The folder of the dense stage; None if it did not run.
         partition: The blocks of the scene; None if the scene is one block.
+        found: The masks that training found; None if they are not exported.
     """
 
     trained: GaussianArrays
@@ -66,6 +82,7 @@ class ExportScene:
     folder: Path
     dense: Path | None = None
     partition: Partition | None = None
+    found: FoundMasks | None = None
 
     @property
     def normalization(self) -> Normalization:
@@ -136,6 +153,12 @@ class _Files:
                 depth = depth / np.float32(self.normalization.scale)
                 write_depth_tiff(path / names[view.name], depth)
 
+    def write_masks(self, path: Path) -> None:
+        found = self.scene.found
+        if found is None:
+            raise ValueError("expected the photographs for the configured formats")
+        write_photo_masks(path, found.folder, found.views, found.photos)
+
     @property
     def dense_folder(self) -> Path:
         if self.scene.dense is None:
@@ -160,6 +183,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     ),
     "dense_points": ("dense_points.ply", lambda path, f: f.write_dense_points(path)),
     "dense_maps": ("dense_maps", lambda path, f: f.write_dense_maps(path)),
+    "masks": ("masks", lambda path, f: f.write_masks(path)),
 }
 # The formats in double precision, whose coordinates are those of the given world.
 _GIVEN_WORLD = ("points", "colmap", "colmap_text", "transforms", "dense_points")
@@ -192,10 +216,13 @@ def export_scene(
     for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]
         write(out / file, files)
-        written.append(file)
+        if (out / file).exists():
+            written.append(file)
     report = ExportReport(
         ExportCounters(exported_gaussians=len(gaussians)), warnings=_warnings(files, config)
     )
+    if "masks" in config.formats and WRITERS["masks"][0] not in written:
+        report.decisions.append("no masks: training left nothing out (train.transients)")
     _write_frame(out, files, written, train, split)
     if not set(config.formats) <= WRITERS.keys():
         _write_rendered_formats(out, scene, config, train, split, threads, report)

@@ -72,7 +72,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
     Raises:
         UserError: ``partition.memory_mb`` is too small, there are more ``partition.blocks`` than
             the photographs allow, the scene of ``split.source: published`` is in no published
-            benchmark, or appearance embeddings are set for a scene in blocks.
+            benchmark, or appearance embeddings or transients are set for a scene in blocks.
     """
     config = as_published(scan, config)
     chosen = {
@@ -93,6 +93,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
             fix="set train.appearance: exposure, or partition.blocks: 1",
         )
     method = _init_method(scan, config)
+    transients, transients_reason = _transients(scan, config, blocks)
     depth_weight, depth_reason = _depth_loss_weight(scan, config, method == "dense" and blocks == 1)
     replaced = _updated(
         config,
@@ -113,6 +114,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
             "train": {
                 "background": value["train.background"],
                 "device": value["train.device"],
+                "transients": transients,
                 "depth_loss_weight": depth_weight,
                 "density": config.train.density.model_copy(update={"max_gaussians": budget}),
             },
@@ -121,6 +123,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
     why = {path: reason for path, (_, reason) in chosen.items()}
     why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
     why["train.depth_loss_weight"] = depth_reason
+    why["train.transients"] = transients_reason
     why["partition.blocks"] = blocks_reason
     why["split.source"] = published_line(scan, config)
     why["features.photos_per_job"] = jobs_reason
@@ -350,6 +353,25 @@ def _depth_loss_weight(scan: Scan, config: Config, dense: bool) -> tuple[float, 
         return 0.0, ""
     weight = SPARSE_DEPTH_WEIGHT
     return weight, f"few photographs: the loss on sparse points' depths has weight {weight:g}"
+
+
+def _transients(scan: Scan, config: Config, blocks: int) -> Choice:
+    """Whether training searches for transients, and why not if photographs may show some."""
+    wanted = config.train.transients
+    if wanted == "find" and blocks > 1:
+        raise UserError(
+            f"train.transients: find is not available in blocks, and the scene has {blocks}",
+            fix="set train.transients: none, or partition.blocks: 1",
+        )
+    if wanted != "auto":
+        return wanted, ""
+    if scan.num_alpha or config.train.density.strategy == "original":
+        return "none", ""
+    if scan.num_masks:  # No masks are read with views.masks: ignore.
+        return "none", "passers-by: only what the masks exclude is left out of the loss"
+    if blocks > 1:
+        return "none", "passers-by are not searched for in blocks"
+    return "find", ""
 
 
 def _updated(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> settled.Config:

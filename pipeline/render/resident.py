@@ -67,7 +67,7 @@ class ResidentImage:
         surroundings: The surroundings of a part of a scene, or None.
     """
 
-    key: tuple[int, int] | None
+    key: tuple[int, ...] | None
     target: Tensor
     mask: Tensor | None
     gain: tuple[float, float, float]

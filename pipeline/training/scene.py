@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -137,11 +138,13 @@ def run_training(inputs: Inputs, run: TrainingRun, notes: Notes | None = None) -
     # Seconds that earlier, killed processes spent on this training.
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
     _describe(result, len(inputs.views), run, notes)
+    notes.decisions += transients_lines(result, inputs.views)
     counters = TrainCounters(
         num_gaussians=len(result.gaussians),
         steps=result.steps,
         known_depths=sum(map(len, inputs.depths or ())),
         device="gpu" if run.options.device.startswith("gpu") else "cpu",
+        **_transient_counters(result, inputs.views),
         **notes.counters,
         **result.counters,
     )
@@ -244,6 +247,28 @@ def _describe(result: TrainResult, num_views: int, run: TrainingRun, notes: Note
         notes.decisions.append(f"{unseen} Gaussians that no training view sees were removed")
     if floaters := result.counters["floaters"]:
         notes.decisions.append(f"{floaters} floaters close to cameras were removed")
+
+
+def transients_lines(result: TrainResult, views: Sequence[View]) -> list[str]:
+    """What ``stage.json`` says about transients in the training ``views``; empty without any."""
+    if not result.transients:
+        return []
+    share = _transient_counters(result, views)["transient_share"]
+    return [
+        f"passers-by: {len(result.transients)} of {len(views)} views show something that the "
+        f"others contradict ({share:.1%} of the pixels): left out of the loss (train.transients)"
+    ]
+
+
+def _transient_counters(result: TrainResult, views: Sequence[View]) -> dict[str, Any]:
+    if result.transients is None:
+        return {}
+    pixels = sum(view.width * view.height for view in views)
+    hidden = sum(int(mask.sum()) for mask in result.transients.values())
+    return {
+        "transient_views": len(result.transients),
+        "transient_share": round(hidden / max(1, pixels), 5),
+    }
 
 
 def too_few_epochs(steps: int, views: int, seconds: float, minutes: float | None) -> str | None:

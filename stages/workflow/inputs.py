@@ -32,6 +32,8 @@ MODEL = ("undistort", *POSES)
 # Inputs of the stages after training.
 TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
+# The folder with the masks of what training left out of views.
+TRANSIENTS = "transients"
 # Roles of stages whose folder has the scene's background, the latest in the DAG first.
 BACKGROUND = ("train", "coarse", "init")
 # Options that rendering outside of training depends on.
@@ -102,6 +104,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
     from pipeline.io.appearance_files import write_appearance
     from pipeline.io.colmap import write_model
     from pipeline.io.npz import write_npz
+    from pipeline.photos.found_masks import write_found
 
     found = trained.result.gaussians if gaussians is None else gaussians
     write_npz(job.out / "gaussians.npz", found)
@@ -110,6 +113,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
     trained.result.curve.write(job.out)
     trained.gains.write(job.out)
     copy_background(job)
+    write_found(job.out / TRANSIENTS, trained.result.transients or {})
     if trained.result.appearance is not None:
         write_appearance(job.out, trained.result.appearance)
     job.record(trained.counters, trained.decisions, trained.warnings)

@@ -189,6 +189,7 @@ CONDITIONAL = {
     "sfm.component": "photographs that fall into several components",
     "sfm.georeference": "photographs with GPS, or gcp_list.txt",
     "train.device": "a GPU (tests/training/test_device.py)",
+    "train.transients": "30 epochs, and someone who passes by (tests/training/transients)",
     "train.density.pixels_per_gaussian": "views of more than 40 000 pixels",
     "train.density.remove_floaters": "floaters near cameras",
 }

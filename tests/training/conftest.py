@@ -17,7 +17,7 @@ from pipeline.config.options import option_paths
 from pipeline.config.settled import Train, TrainOptions
 from pipeline.render import make_backend
 from pipeline.render.views import render_view
-from pipeline.scene.views import View
+from pipeline.scene.views import View, resized
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop import session
 
@@ -89,6 +89,11 @@ def camera_at(angle: float) -> View:
     pose[:3, 3] = -pose[:3, :3] @ centre
     half = WIDTH / 2, HEIGHT / 2
     return View("", "", None, WIDTH, HEIGHT, FOCAL, FOCAL, *half, pose, False)
+
+
+def resized_views(views: list[View], factor: int) -> list[View]:
+    """The views with ``factor`` times as many pixels along each side."""
+    return [resized(view, factor * view.width, factor * view.height) for view in views]
 
 
 @pytest.fixture(scope="session")

@@ -49,7 +49,7 @@ class _Images:
 
     def __init__(self, gpu: Gpu):
         self.gpu = gpu
-        self._cache: OrderedDict[tuple[int, int], _Image] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, ...], _Image] = OrderedDict()
         self._size = 0
 
     def get(self, image: ResidentImage) -> _Image:

@@ -28,12 +28,14 @@ class Target:
     """One view's pixels.
 
     Attributes:
-        rgb: (H, W, 3) uint8, multiplied by alpha; 0 where ignored.
+        rgb: (H, W, 3) uint8, multiplied by alpha; 0 where a mask excludes it.
         alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
         ignored: (H, W) bool, True for ignored pixels, or None if there are none.
         surroundings: The layers around a block, or None if the whole scene is trained.
         is_overview: Whether the view is an overview of a block: the block is in the ignored pixels,
             and trained in another view.
+        transient: (H, W) bool, the ignored pixels in which something that passed by hides the scene
+            (``training.transients``), or None if there are none. ``rgb`` has it.
     """
 
     rgb: Tensor
@@ -41,6 +43,7 @@ class Target:
     ignored: Tensor | None
     surroundings: Surroundings | None = None
     is_overview: bool = False
+    transient: Tensor | None = None
 
     def over(self, background: tuple[float, float, float]) -> Tensor:
         """The image over ``background`` (in [0, 1]): (H, W, 3), uint8 if the view is opaque, else
@@ -125,6 +128,11 @@ class Targets:
     def hidden(self) -> list[int]:
         """Indices of the views whose pixels are all ignored."""
         return [index for index, stored in enumerate(self._full) if stored.hidden]
+
+    def reduced(self, index: int, factor: int) -> Target:
+        """The same as ``get``, without storing the result."""
+        full = self._full[index].get()
+        return full if factor == 1 else _reduce(full, factor)
 
     def drop(self, indices: Sequence[int]) -> None:
         """Remove these views; the indices of later views decrease."""

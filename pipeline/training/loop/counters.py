@@ -72,6 +72,25 @@ class TrainCounters(StageCounters):
         description="Number of Gaussians removed because they were close to a single camera, "
         "between neighbouring cameras, or before places beside the cameras.",
     )
+    ghosts: int = Field(
+        0,
+        ge=0,
+        description="Number of Gaussians removed because they explained mostly what was left out "
+        "of the loss by `train.transients`.",
+    )
+    transient_views: int | None = Field(
+        None,
+        ge=0,
+        description="Number of training views of which a part was left out of the loss by "
+        "`train.transients`; absent if transients were not searched for.",
+    )
+    transient_share: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Share of the pixels of all training views that was left out of the loss by "
+        "`train.transients`; absent if transients were not searched for.",
+    )
 
     def headline(self) -> str:
         return f"{counted(self.num_gaussians, 'Gaussian')} after {counted(self.steps, 'step')}"

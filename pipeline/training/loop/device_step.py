@@ -91,11 +91,13 @@ class DeviceStep(StepEngine):
     def _image(self, step: Step) -> ResidentImage:
         view, target = step.view, step.view.target
         fixed = target.alpha is None or self.scene.background != "random"
+        transients = self.state.transients
+        version = 0 if transients is None else transients.version
         red, green, blue = (
             (1.0, 1.0, 1.0) if self.scene.gains is None else self.scene.gains[view.index].tolist()
         )
         return ResidentImage(
-            key=(view.index, view.factor) if fixed else None,
+            key=(view.index, view.factor, version) if fixed else None,
             target=target.over(view.background),
             mask=target.ignored,
             gain=(red, green, blue),

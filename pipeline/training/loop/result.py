@@ -38,6 +38,8 @@ class TrainResult:
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
         appearance: The appearance of the Gaussians in the training views, or None.
         early_fit: The fit while one view was held back; None if none was.
+        transients: (H, W) bool at the size of the view, true for what was left out of the loss, by
+            the names of the views that show any; None if it was not searched for.
     """
 
     gaussians: Gaussians
@@ -54,6 +56,7 @@ class TrainResult:
     intrinsics: dict[int, NDArray[np.float64]] | None
     appearance: Appearance | None
     early_fit: EarlyFit | None
+    transients: dict[str, NDArray[np.bool_]] | None
 
 
 def result_of(
@@ -84,4 +87,5 @@ def result_of(
         intrinsics=None if intrinsics is None else intrinsics.by_id(),
         appearance=appearance,
         early_fit=state.early_fit,
+        transients=None if state.transients is None else state.transients.by_name(scene.views),
     )

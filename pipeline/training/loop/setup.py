@@ -29,6 +29,7 @@ from pipeline.training.density import make_strategy
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from pipeline.training.run import TrainingRun
+from pipeline.training.transients.search import MIN_VIEWS, Transients
 
 Warn = Callable[[str], None]
 
@@ -133,7 +134,25 @@ def initial_state(
     adam = Adam(gaussians, AdamOptions.of(options), backend)
     if scene.sky is not None:
         adam.freeze(torch.from_numpy(of_fill(gaussians.opacity_logits.numpy())))
-    return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
+    return TrainState(
+        gaussians,
+        adam,
+        density,
+        cameras,
+        rng,
+        order,
+        appearance,
+        transients=initial_transients(scene, run),
+        clock=start,
+    )
+
+
+def initial_transients(scene: TrainingScene, run: TrainingRun) -> Transients | None:
+    """The transients before the first search, or None if none are searched for."""
+    few = len(scene.views) < MIN_VIEWS
+    if run.options.transients == "none" or run.is_part or few or scene.targets.have_alpha:
+        return None
+    return Transients.of(scene.views, run.steps)
 
 
 def _without_hidden_views(inputs: Inputs, targets: Targets, warn: Warn) -> Inputs:

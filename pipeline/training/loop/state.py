@@ -19,6 +19,7 @@ from pipeline.training.density import Changes, Strategy, Update
 from pipeline.training.few_views import EarlyFit
 from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
+from pipeline.training.transients.search import Transients
 
 CURVE_RECORDS = 100  # The number of records of the curve in a run.
 
@@ -36,6 +37,7 @@ class Counters:
         blind_steps: The number of steps whose view saw no Gaussian.
         unseen: The number of Gaussians removed at the end because no training view saw them.
         floaters: The number of Gaussians removed because they were close to a single camera.
+        ghosts: The number of Gaussians removed because they explained transients.
     """
 
     changes: Changes = field(default_factory=Changes)
@@ -45,6 +47,7 @@ class Counters:
     blind_steps: int = 0
     unseen: int = 0
     floaters: int = 0
+    ghosts: int = 0
 
 
 @dataclass
@@ -66,6 +69,7 @@ class TrainState:
         order: (V,) int64, the order of the views in this epoch, of which ``position`` are done.
         appearance: The embeddings of the views; None if appearance is not modelled.
         early_fit: The fit while one view was held back; None until it is measured.
+        transients: What only single views show; None if it is not searched for.
         curve: The records without times; ``curve_seconds`` has the time of each.
         seconds: The training time so far, in all processes.
     """
@@ -78,6 +82,7 @@ class TrainState:
     order: NDArray[np.int64]
     appearance: AppearanceEmbeddings | None = None
     early_fit: EarlyFit | None = None
+    transients: Transients | None = None
     position: int = 0
     step: int = 0
     clock: int = 0
@@ -157,6 +162,8 @@ class TrainState:
         result |= self.density.arrays() | self.cameras.arrays()
         if self.appearance is not None:
             result |= self.appearance.arrays()
+        if self.transients is not None:
+            result |= self.transients.arrays()
         return result | {"last": self.adam.last.numpy()}
 
     def values(self) -> dict[str, Any]:
@@ -206,6 +213,8 @@ class TrainState:
         self.cameras.restore(arrays)
         if self.appearance is not None:
             self.appearance.restore(arrays)
+        if self.transients is not None:
+            self.transients.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]
         self.early_fit = early_fit

@@ -8,10 +8,12 @@ from pipeline.config.settled import TrainOptions
 from pipeline.render import BACKGROUNDS, Backend, Color, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import freed_memory
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.appearance.embedding import with_appearance
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.step_view import StepView
 from pipeline.training.data.targets import psnr_of, usable_factor
-from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
+from pipeline.training.density.floaters import FADED_LOGIT, IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.density.strategy import DensityStep
 from pipeline.training.few_views import EarlyFit, central_view
@@ -24,6 +26,8 @@ from pipeline.training.loop.state import CURVE_RECORDS, TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.optimisers.adam import AdamStep
 from pipeline.training.run import TrainingRun
+from pipeline.training.transients.evidence import ReducedPhotographs
+from pipeline.training.transients.search import reduction
 
 # PSNR is measured in some of the steps only: it takes a pass over the image.
 PSNR_INTERVAL = 10
@@ -99,12 +103,13 @@ class Trainer:
 
     def step_view(self, index: int, background: Color) -> StepView:
         """A training view at the size of this step."""
-        factor = self.factor()
+        factor, transients = self.factor(), self.state.transients
+        target = self.scene.target(index, factor)
         return StepView(
             index,
             factor,
             self.scene.views[index],
-            self.scene.target(index, factor),
+            target if transients is None else transients.applied(target, index),
             self.camera(index, factor),
             background,
         )
@@ -134,10 +139,12 @@ class Trainer:
         """Add noise, densify, prune and reset opacities after these steps of the schedule."""
         state, schedule = self.state, self.schedule
         floaters_due = self.floaters is not None and self.floaters.is_due(steps, run_length)
-        if not floaters_due and not state.density.is_due(steps):
+        transients_due = state.transients is not None and state.transients.is_due(steps, run_length)
+        if not floaters_due and not transients_due and not state.density.is_due(steps):
             return
         self.engine.invalidate()
-        faded = self.fade_floaters() if floaters_due else 0
+        faded = self.fade_ghosts() if transients_due else 0
+        faded += self.fade_floaters() if floaters_due else 0
         if self.run.is_part:
             self.backend.release_memory()  # The arrays of all Gaussians are copied.
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
@@ -173,6 +180,17 @@ class Trainer:
         self.state.counters.floaters += found
         return found
 
+    def fade_ghosts(self) -> int:
+        """Search for transients, make the Gaussians that explain them transparent, and return their
+        number."""
+        state = self.state
+        assert state.transients is not None
+        ghosts = state.transients.search(self.reduced_photographs())
+        state.gaussians.opacity_logits[ghosts] = FADED_LOGIT
+        found = int(ghosts.sum())
+        state.counters.ghosts += found
+        return found
+
     def raise_sh_degree(self) -> None:
         """Allocate the coefficients of higher degrees when they come into use."""
         degree = self.schedule.sh_degree_at(self.state.clock)
@@ -201,6 +219,23 @@ class Trainer:
             ),
             pixel=factor**2,
             backend=self.backend,
+        )
+
+    def reduced_photographs(self) -> ReducedPhotographs:
+        state, scene, factor = self.state, self.scene, reduction(self.scene.views)
+
+        def shown(index: int) -> Gaussians:
+            if state.appearance is None:
+                return state.gaussians
+            return with_appearance(state.gaussians, state.appearance.embeddings[index])
+
+        return ReducedPhotographs(
+            [self.camera(index, factor) for index in range(len(scene.views))],
+            lambda index: scene.targets.reduced(index, factor),
+            shown,
+            scene.gains,
+            self.raster_options(BACKGROUNDS.get(scene.background, BACKGROUNDS["black"])),
+            self.backend,
         )
 
     def raster_options(self, background: Color) -> RasterOptions:

@@ -49,11 +49,12 @@ class AlphaLoss:
 def mask_gradient(target: Target, weight: float) -> Tensor | None:
     """(H, W) float32 gradient of ``weight`` times the sum of alpha over ignored pixels, divided by
     the number of the other pixels; None without ignored pixels or weight, and for overviews of a
-    block, whose ignored pixels are not empty."""
+    block, whose ignored pixels are not empty. Nor are those that transients hide."""
     if target.ignored is None or target.is_overview or not weight:
         return None
     counted = target.ignored.numel() - int(target.ignored.sum())
-    return target.ignored * (weight / max(1, counted))
+    empty = target.ignored if target.transient is None else target.ignored & ~target.transient
+    return empty * (weight / max(1, counted))
 
 
 def error_gradient(

@@ -1,0 +1,1 @@
+"""Transients: what only one or few photographs show, such as people who pass by."""

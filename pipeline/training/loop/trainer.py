@@ -243,8 +243,11 @@ def make_engine(
     schedule: Schedule,
 ) -> StepEngine:
     """Steps on the backend's device, or by its operators if that is the CPU or if the strategy
-    needs more in a step than devices do: losses of its own, noise or drop-out."""
-    operators = state.density.statistics is None or schedule.dropout > 0
+    needs more in a step than devices do: losses of its own, noise, drop-out, or light that varies
+    over the image."""
+    light = scene.inputs.light or ()
+    uniform = all(of.is_uniform for of in light)
+    operators = state.density.statistics is None or schedule.dropout > 0 or not uniform
     training = None if operators else backend.resident()
     if training is None:
         return OperatorStep(scene, state, run, backend)

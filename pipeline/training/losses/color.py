@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from pipeline.render import Backend, Forward
+from pipeline.scene.exposure import ViewLight
+from pipeline.scene.views import reduced_size
 from pipeline.training.data.step_view import StepView
 from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
 
@@ -33,12 +37,12 @@ class ColorLoss:
 
     Attributes:
         ssim_weight, squared_error_weight: See ``Backend.l1_ssim``.
-        gains: (V, 3) factors of the renders; None: all 1.
+        light: The light of each view, by which renders are multiplied; None: all 1.
     """
 
     ssim_weight: float
     squared_error_weight: float
-    gains: Tensor | None
+    light: Sequence[ViewLight] | None
     backend: Backend
     threads: int
 
@@ -48,12 +52,12 @@ class ColorLoss:
         """Compare a render with its photograph."""
         target, around = view.target, view.target.surroundings
         image = target.over(view.background)
-        gain = None if self.gains is None else self.gains[view.index]
+        factor = self._factor(view)
         color = rendered.color
         if around is not None:
             color = self.backend.compose(around, color, rendered.alpha, self.threads)
-        if gain is not None:
-            color = color * gain
+        if factor is not None:
+            color = color * factor
         loss = self.backend.l1_ssim(
             color,
             image,
@@ -63,9 +67,16 @@ class ColorLoss:
             self.threads,
         )
         psnr = target.psnr(color, image) if measures_psnr else None
-        d_color, d_alpha = loss.grad if gain is None else loss.grad * gain, None
+        d_color, d_alpha = loss.grad if factor is None else loss.grad * factor, None
         if around is not None:
             d_color, d_alpha = self.backend.compose_backward(
                 around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads
             )
         return ColorGradients(float(loss.loss), d_color, d_alpha, psnr)
+
+    def _factor(self, view: StepView) -> Tensor | None:
+        """The factor of a render: (3,), or (H, W, 3) where it varies; None for 1."""
+        if self.light is None:
+            return None
+        size = reduced_size(view.full, view.factor)
+        return torch.from_numpy(self.light[view.index].factor(view.full, size))

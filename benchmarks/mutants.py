@@ -213,7 +213,7 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "exposure_gradient": Mutant(
         "pipeline/training/losses/color.py",
-        "loss.grad if gain is None else loss.grad * gain",
+        "loss.grad if factor is None else loss.grad * factor",
         "loss.grad",
         "exposure left out of the gradient",
         ("tests/training/loop/test_first_step.py",),

@@ -57,11 +57,10 @@ POSES_OF_SPLIT = "poses are given; points are given or from the training photogr
 
 
 class _Measured(NamedTuple):
-    """The measures of a view, and its PSNR without the factors of its exposure and without its
-    fitted appearance; None where there are none."""
+    """The measures of a view, and its PSNR without its fitted appearance; None where it has
+    none."""
 
     record: ViewMetrics
-    without_gains: float | None
     without_fit: float | None
     is_masked: bool
 
@@ -118,7 +117,7 @@ def evaluate_views(
     return Evaluation(
         psnr=psnr,
         train_psnr=train_psnr,
-        psnr_without_gains=_mean([view.without_gains for view in measured]),
+        psnr_without_gains=_mean([view.psnr_without_gains for view in per_view]),
         psnr_without_fit=without_fit,
         ssim=float(np.mean([view.ssim for view in per_view])),
         flip=_mean([view.flip for view in per_view]),
@@ -197,11 +196,11 @@ def _compare(
         ssim=found.ssim(image),
         flip=found.flip(image),
         lpips=lpips,
+        psnr_without_gains=found.psnr(to_bytes(found.rgb)) if gains else None,
         render=file.name,
     )
-    without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
     without_fit = None if found.own is None else found.psnr(to_bytes(found.own))
-    return _Measured(record, without_gains, without_fit, found.is_masked)
+    return _Measured(record, without_fit, found.is_masked)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

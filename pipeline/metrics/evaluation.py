@@ -23,6 +23,9 @@ class ViewMetrics(JsonObject):
         None, description="FLIP, 0 to 1; lower is better. null where it was not measured."
     )
     lpips: float | None = Field(description="null where it was not measured.")
+    psnr_without_gains: float | None = Field(
+        None, description="PSNR without the view's exposure gains, dB; null where there are none."
+    )
     render: str = Field(description="File in `evaluate/renders/`.")
 
 

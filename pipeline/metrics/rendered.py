@@ -111,17 +111,17 @@ class ViewRenderer:
         if self.train.refine_poses and view.is_test:
             from pipeline.training.cameras.fit_pose import fit_pose
 
-            gain, weight = self.gains.of(name), self.train.ssim_loss_weight
+            light, weight = self.gains.of(name), self.train.ssim_loss_weight
             extent = self.protocol.extent
-            view = fit_pose(shown, view, photo, pixels.mask, gain, options, extent, weight)
+            view = fit_pose(shown, view, photo, pixels.mask, light, options, extent, weight)
         if name in self._fitted:
             own = render_rgb(self.gaussians, view, options)
         return Rendered(name, render_rgb(shown, view, options), own, photo, pixels.mask)
 
     def with_exposure(self, rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
-        """A render (H, W, 3) of a view, multiplied by its gains, with 8 bits."""
-        gain = self.gains.of(view.name)
-        return to_bytes(rgb if gain is None else rgb * np.array(gain, np.float32))
+        """A render (H, W, 3) of a view, multiplied by its light, with 8 bits."""
+        light = self.gains.of(view.name)
+        return to_bytes(rgb if light is None else rgb * light.factor(view))
 
     def smallest_side(self) -> int:
         """Of the measured parts of all views, pixels."""

@@ -4,17 +4,19 @@ The colours that different photographs record of one point differ by exposure an
 display values, which follow a power law of light, both are one factor per channel. With y_pv the
 logarithm of the value of point p in view v, the model is y_pv = c_p + g_v. It is solved by
 alternating means over points and medians over views; the geometric mean of the gains is 1.
+``photos.shading`` adds factors that vary over the image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.photos.load import load_view
+from pipeline.scene.exposure import half_diagonal
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, evenly_spaced
 
@@ -30,6 +32,7 @@ SAMPLE = 64
 ROUNDS = 20
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,64 @@ class Exposures:
     measured: int
 
 
-def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures:
-    """Estimate the gains of ``views`` from their colours at the observations of ``model``.
+@dataclass(frozen=True)
+class Observations:
+    """The colours of points in photographs, M observations.
 
-    Views of one photograph have the same gains.
+    Attributes:
+        point: (M,) the point of each observation, a row of ``Reconstruction.points``.
+        view: (M,) its view.
+        position: (M, 2) its place in the image, as in ``scene.exposure.ViewLight``.
+        y: (M, 3) log2 of its display values.
+        photo_of: (V,) the photograph of each view: views of one photograph share a gain.
+        camera_of: (V,) the camera of each view, counted from 0.
+        in_parts: Whether views are parts of photographs, without a lens of their own.
+    """
+
+    point: Indices
+    view: Indices
+    position: Array
+    y: Array
+    photo_of: Indices
+    camera_of: Indices
+    in_parts: bool
+
+    @property
+    def photo(self) -> Indices:
+        """(M,) the photograph of each observation."""
+        return self.photo_of[self.view]
+
+    @property
+    def camera(self) -> Indices:
+        """(M,) the camera of each observation."""
+        return self.camera_of[self.view]
+
+    @property
+    def num_photos(self) -> int:
+        return int(self.photo_of.max(initial=-1)) + 1
+
+    @property
+    def num_cameras(self) -> int:
+        return int(self.camera_of.max(initial=-1)) + 1
+
+    def select(self, chosen: NDArray[np.bool_]) -> Observations:
+        """Those of the observations that are ``chosen`` (M,), without points that have only one
+        of them; points are numbered again."""
+        _, index, count = np.unique(self.point[chosen], return_inverse=True, return_counts=True)
+        several = count[index] >= 2
+        _, point = np.unique(index[several], return_inverse=True)
+        rows = np.flatnonzero(chosen)[several]
+        return replace(
+            self,
+            point=point,
+            view=self.view[rows],
+            position=self.position[rows],
+            y=self.y[rows],
+        )
+
+
+def observe(views: Sequence[View], model: Reconstruction) -> Observations:
+    """The colours of ``views`` at the observations of ``model``.
 
     Args:
         views: The views of images of ``model``, matched by name. They may have another resolution
@@ -61,8 +118,12 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
     owner = np.repeat(np.arange(len(points)), points.track_length)
     numbers = {image.name: number for number, image in model.images.items()}
     groups: dict[str, int] = {}
-    group = [groups.setdefault(view.source or view.name, len(groups)) for view in views]
-    point_of, view_of, colours = [], [], []
+    photos = [groups.setdefault(view.source or view.name, len(groups)) for view in views]
+    cameras: dict[int, int] = {}
+    bodies = [cameras.setdefault(view.camera_id, len(cameras)) for view in views]
+    point_of, view_of, positions = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], []
+    colours = [np.zeros((0, 3))]
+    positions.append(np.zeros((0, 2)))
     for index, view in enumerate(views):
         number = numbers[view.name]
         observations = np.flatnonzero(points.track_image_id == number)
@@ -70,15 +131,21 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
             continue
         camera = model.cameras[model.images[number].camera_id]
         scale = np.array([view.width / camera.width, view.height / camera.height])
-        usable, log_colours = _log_colours(view, points.track_xy[observations] * scale)
+        xy = points.track_xy[observations] * scale
+        usable, log_colours = _log_colours(view, xy)
         point_of.append(owner[observations[usable]])
-        view_of.append(np.full(len(log_colours), group[index]))
+        view_of.append(np.full(len(log_colours), index))
+        positions.append((xy[usable] - (view.cx, view.cy)) / half_diagonal(view))
         colours.append(log_colours)
-    if not point_of:
-        return Exposures(np.ones((len(views), 3)), 0.0, 0)
-    point, view_index = np.concatenate(point_of), np.concatenate(view_of)
-    found = solve_gains(point, view_index, np.concatenate(colours), len(groups))
-    return Exposures(found.gains[group], found.spread, found.measured)
+    return Observations(
+        np.concatenate(point_of),
+        np.concatenate(view_of),
+        np.concatenate(positions),
+        np.concatenate(colours),
+        np.array(photos, np.int64),
+        np.array(bodies, np.int64),
+        any(view.source is not None for view in views),
+    )
 
 
 def sample_views(views: Sequence[View]) -> list[View]:
@@ -101,7 +168,13 @@ def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
 
 
 def solve_gains(
-    point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
+    point: Indices,
+    view: Indices,
+    y: Array,
+    count: int,
+    *,
+    start: Array | None = None,
+    rounds: int = ROUNDS,
 ) -> Exposures:
     """Solve for the gains of views.
 
@@ -109,6 +182,8 @@ def solve_gains(
         point, view: (M,) indices of the point and the view of each observation.
         y: (M, 3) log2 display values.
         count: The number of views.
+        start: (count, 3) log2 of the gains to start from; None: 0.
+        rounds: The number of alternations.
     """
     _, point = np.unique(point, return_inverse=True)
     observed = np.bincount(point)
@@ -117,10 +192,10 @@ def solve_gains(
     members = [np.flatnonzero(view == v) for v in range(count)]
     weight = np.maximum(np.bincount(point, minlength=len(observed)), 1)
     measured = np.array([len(m) >= MIN_OBSERVATIONS for m in members])
-    gains = np.zeros((count, 3))
+    gains = np.zeros((count, 3)) if start is None else start.copy()
     if not measured.any():
         return Exposures(np.ones((count, 3)), 0.0, 0)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         normalized = y - gains[view]
         sums = [np.bincount(point, normalized[:, c], len(observed)) for c in range(3)]
         colour = np.stack(sums, axis=1)

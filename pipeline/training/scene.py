@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
@@ -189,7 +187,7 @@ def scene_inputs(
         initial=initial,
         extent=extent,
         scale=scene_scale(extent, points),
-        gains=np.array([gains.of(view.name) for view in training]) if gains else None,
+        light=gains.of_all(view.name for view in training),
         depths=(
             _known_depths(training, scene.manifest, points, initial, notes, dense)
             if run.options.depth_loss_weight

@@ -15,7 +15,7 @@ from pipeline.metrics.protocol import NUM_TRAINING_VIEWS, choose_protocol
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
 from pipeline.scene.appearance import Appearance
-from pipeline.scene.exposure import ExposureGains
+from pipeline.scene.exposure import ExposureGains, ViewLight
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
@@ -107,7 +107,9 @@ def test_gains_multiply_the_renders(tmp_path):
         Evaluate(),
         config,
         tmp_path / "out",
-        gains=ExposureGains({"a": (100 / 255,) * 3, "b": (50 / 255,) * 3}),
+        gains=ExposureGains(
+            {"a": ViewLight(gain=(100 / 255,) * 3), "b": ViewLight(gain=(50 / 255,) * 3)}
+        ),
         threads=1,
     )
     assert found.psnr == 100

@@ -7,11 +7,16 @@ import pytest
 from PIL import Image
 
 from pipeline.geometry.cameras import Camera
-from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.photos.exposure import Exposures, observe, sample_views, solve_gains
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 
 SIZE, POINTS = 64, 400
+
+
+def measure_exposures(views, model) -> Exposures:
+    seen = observe(views, model)
+    return solve_gains(seen.point, seen.photo, seen.y, seen.num_photos)
 
 
 def wall(folder, gains, seed=0):

@@ -18,7 +18,7 @@ from pipeline.io.npz import write_npz
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.record import StageRecord
-from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.exposure import NO_GAINS, ExposureGains, ViewLight
 from pipeline.scene.georeference import CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
@@ -115,7 +115,7 @@ def test_settings_of_another_version_are_one_error(results: Path) -> None:
 
 
 def test_gains_of_other_views_are_one_error(results: Path) -> None:
-    ExposureGains({"0.png": (1.0, 1.0, 1.0)}).write(results / "train")
+    ExposureGains({"0.png": ViewLight(gain=(1.0, 1.0, 1.0))}).write(results / "train")
     assert "found none for 1.png" in error(results)
 
 

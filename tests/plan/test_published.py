@@ -18,7 +18,7 @@ from pipeline.plan.protocols import PUBLISHED_SCENES, recognise
 from pipeline.plan.published import planned_deviations
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
-from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.exposure import NO_GAINS, ExposureGains, ViewLight
 from pipeline.scene.views import load_views
 from tests.io.test_transforms import frame, write
 from tests.metrics.test_evaluate import nothing
@@ -211,7 +211,7 @@ def test_a_part_of_the_listed_test_views_is_said(tmp_path: Path) -> None:
 
 def test_exposure_gains_and_moved_test_cameras_are_said(tmp_path: Path) -> None:
     scene = tanks_and_temples(tmp_path)
-    gains = ExposureGains({f"p{i:02d}.jpg": (1.0, 1.0, 1.0) for i in range(11)})
+    gains = ExposureGains({f"p{i:02d}.jpg": ViewLight(gain=(1.0, 1.0, 1.0)) for i in range(11)})
     assert "gains" in measured(scene, gains=gains).text
     assert "pose of each test camera" in measured(scene, train=Train(refine_poses=True)).text
 

@@ -5,15 +5,20 @@ from pathlib import Path
 import pytest
 
 from pipeline.runtime.errors import UserError
-from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.exposure import NO_GAINS, ExposureGains, ViewLight
 
-GAINS = ExposureGains({"a.jpg": (1.1, 1 / 3, 0.9), "b.jpg": (0.1 + 0.2, 1.0, 1.0)})
+GAINS = ExposureGains(
+    {
+        "a.jpg": ViewLight(gain=(1.1, 1 / 3, 0.9), vignetting=(-0.1, -1 / 3), slope=(0.1, -0.2)),
+        "b.jpg": ViewLight(gain=(0.1 + 0.2, 1.0, 1.0)),
+    }
+)
 
 
 def test_gains_are_read_as_they_were_written(tmp_path: Path) -> None:
     GAINS.write(tmp_path)
     found = ExposureGains.read_for(tmp_path, ["b.jpg", "a.jpg"])
-    assert found == GAINS and found.of("a.jpg") == (1.1, 1 / 3, 0.9)
+    assert found == GAINS and found.of("a.jpg") == GAINS.of("a.jpg")
 
 
 def test_without_gains_every_view_is_known(tmp_path: Path) -> None:
@@ -31,6 +36,6 @@ def test_gains_of_other_views_are_an_error(tmp_path: Path) -> None:
 
 
 def test_a_gain_has_three_channels(tmp_path: Path) -> None:
-    (tmp_path / "exposure.json").write_text('{"a.jpg": [1.0, 1.0]}')
-    with pytest.raises(UserError, match=r"exposure\.json: expected ExposureGains .*a\.jpg\.2"):
+    (tmp_path / "exposure.json").write_text('{"a.jpg": {"gain": [1.0, 1.0]}}')
+    with pytest.raises(UserError, match=r"exposure\.json: .*a\.jpg\.gain\.2"):
         ExposureGains.read(tmp_path)

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.photos.disagreement import colour_disagreement
-from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.photos.exposure import observe, sample_views, solve_gains
+from pipeline.photos.shading import (
+    Parts,
+    choose_parts,
+    fit_light,
+    is_trusted,
+    trusted,
+    without_gains,
+)
 from pipeline.scene.collection import is_collection
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.reconstruction import Reconstruction
@@ -77,17 +85,56 @@ def choose_appearance(
                 "each has an appearance embedding (train.appearance)"
             )
             return choice
+    _choose_light(choice, views, model, wanted)
+    return choice
+
+
+def _choose_light(
+    choice: AppearanceChoice, views: Sequence[View], model: Reconstruction, wanted: str
+) -> None:
+    """Add the light of the photographs to ``choice``: gains for all if ``wanted`` is ``exposure``,
+    else the parts of the model for which a sample of the photographs is evidence."""
+    sample = observe(sample_views(views), model)
+    parts, uses_gains = choose_parts(sample), wanted == "exposure"
     if wanted == "measured":
-        spread = measure_exposures(sample_views(views), model).spread
+        spread = solve_gains(sample.point, sample.photo, sample.y, sample.num_photos).spread
         choice.counters["exposure_spread_stops"] = round(spread, 4)
-        if spread < EXPOSURES_DIFFER:
-            return choice
-    found = measure_exposures(views, model)
-    photographs = len({view.source or view.name for view in views})
+        if spread >= EXPOSURES_DIFFER:
+            uses_gains = is_trusted(sample, fit_light(sample, parts))
+            if not uses_gains:
+                choice.decisions.append(
+                    f"exposures seem to differ by {spread:.2f} stops, but the parts of most images "
+                    "do not agree on their gains: renders have none "
+                    "(train.appearance: exposure uses them)"
+                )
+    if not uses_gains and parts == Parts():
+        return
+    seen = observe(views, model)
+    fitted = fit_light(seen, parts)
+    light = trusted(seen, fitted) if uses_gains else without_gains(fitted)
+    if uses_gains:
+        choice.decisions.append(
+            f"exposures differ by {fitted.exposure_stops:.2f} stops: renders are multiplied by "
+            f"gains that were measured in {fitted.measured} of {seen.num_photos} photographs, as "
+            "far as parts of each image agree"
+        )
+    if parts.vignetting:
+        choice.counters["vignetting_stops"] = round(light.vignetting_stops, 4)
+        choice.decisions.append(
+            f"corners are darker than the centre of the image, by up to "
+            f"{light.vignetting_stops:.2f} stops: renders are multiplied by the vignetting of each "
+            "camera"
+        )
+    if parts.slopes:
+        choice.counters["slope_stops"] = round(light.slope_stops, 4)
+        choice.decisions.append(
+            f"brightness slopes across photographs, by {light.slope_stops:.2f} stops from the "
+            "centre to the corner: renders are multiplied by the slope of each photograph"
+        )
     choice.decisions.append(
-        f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
-        f"measured in {found.measured} of {photographs} photographs"
+        "the colours of the Gaussians are those of "
+        + ("a photograph of typical exposure" if uses_gains else "the photographs")
+        + (" at the centre of the image" if parts != Parts() else "")
     )
     names = [view.name for view in views]
-    choice.gains = ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
-    return choice
+    choice.gains = ExposureGains(dict(zip(names, light.of_views(seen), strict=True)))

@@ -79,8 +79,8 @@ class BlockLayers:
         scene = next(images)[0]
         error = scene - self.backend.compose(around, block, block_alpha, self.options.threads)
         correction = (error * 255).round().clamp(-127, 127).to(torch.int8)
-        if (gain := self.gains.of(view.name)) is not None:
-            scene = scene * torch.tensor(gain, dtype=torch.float32)
+        if (light := self.gains.of(view.name)) is not None:
+            scene = scene * torch.from_numpy(light.factor(view))
         return Layers(
             surroundings=replace(around, correction=correction),
             weight=self._weight(view),

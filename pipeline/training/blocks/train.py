@@ -111,7 +111,7 @@ def block_inputs(scene: SceneInBlocks, number: int, run: TrainingRun) -> Inputs:
         initial=initial,
         extent=whole.extent,
         scale=whole.scale,
-        gains=None if whole.gains is None else whole.gains[kept],
+        light=None if whole.light is None else [whole.light[index] for index in kept],
         depths=whole.depths
         and [
             *(_cropped(whole.depths[i], windows[whole.views[i].name].window) for i in shown),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import limit_sh_degree, raster_camera
+from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.poses import PoseRefinement
@@ -25,7 +25,7 @@ def fit_pose(
     view: View,
     photo: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None,
-    gain: Sequence[float] | None,
+    light: ViewLight | None,
     options: RasterOptions,
     extent: float,
     ssim_weight: float,
@@ -35,7 +35,7 @@ def fit_pose(
     Args:
         photo: (H, W, 3) colours over the background of ``options``.
         mask: (H, W) bool, False for ignored pixels.
-        gain: The factor of each channel of the render.
+        light: The light of the photograph, by which the render is multiplied.
         extent: The unit of translations (``scene.views.scene_extent``), world units.
         ssim_weight: The weight of SSIM in the loss, as in training.
     """
@@ -45,7 +45,7 @@ def fit_pose(
     camera = raster_camera(view)
     target = torch.from_numpy(np.ascontiguousarray(photo))
     ignored = None if mask is None else torch.from_numpy(~mask)
-    factor = torch.tensor([1.0, 1.0, 1.0] if gain is None else list(gain), dtype=torch.float32)
+    factor = torch.ones(3) if light is None else torch.from_numpy(light.factor(view))
     best, least = poses.poses[0].copy(), math.inf
     for number in range(FIT_STEPS):
         rendered = backend.forward(*gaussians.parameters(), poses.camera(camera, 0), options)

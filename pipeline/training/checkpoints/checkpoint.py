@@ -53,12 +53,12 @@ def identity_of(inputs: Inputs, run: TrainingRun) -> str:
         for v in inputs.views
     ]
     sizes = (inputs.extent, inputs.size, inputs.seen_share)
-    gains = None if inputs.gains is None else inputs.gains.tolist()
+    light = None if inputs.light is None else [of.model_dump() for of in inputs.light]
     embeddings = None if inputs.embeddings is None else inputs.embeddings.tolist()
     empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
     # Another device can continue: the log says so.
     options = run.options.model_dump(exclude={"device"})
-    text = json.dumps([STATE_VERSION, options, run.seed, sizes, views, gains, embeddings, empty])
+    text = json.dumps([STATE_VERSION, options, run.seed, sizes, views, light, embeddings, empty])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
     for known in inputs.depths or ():

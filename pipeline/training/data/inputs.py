@@ -6,9 +6,12 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from pipeline.scene.views import View
+from pipeline.scene.exposure import ViewLight
+from pipeline.scene.views import View, reduced_size
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.data.targets import LayerSource
@@ -25,9 +28,9 @@ class Inputs:
             of camera refinement.
         scale: The unit of the means' learning rate and of the sizes of Gaussians, world units
             (``training.data.known_depths.scene_scale``); None: the extent.
-        gains: (V, 3) brightness of each photograph relative to the scene's typical one
-            (``photos.exposure``), by which renders are multiplied before the loss. Only for views
-            without alpha.
+        light: The light of each photograph relative to the scene's typical one
+            (``photos.exposure``, ``photos.shading``), by which renders are multiplied
+            before the loss; None: all 1. Only for views without alpha.
         embeddings: (V, K) appearance embeddings of the photographs before training
             (``training.appearance``); None: appearance is not modelled. Only for a whole scene.
         depths: The known depths of each view for the depth loss (``training.losses.depth``).
@@ -43,7 +46,7 @@ class Inputs:
     initial: Gaussians
     extent: float
     scale: float | None = None
-    gains: NDArray[np.float64] | None = None
+    light: Sequence[ViewLight] | None = None
     embeddings: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
     empty_depths: NDArray[np.float64] | None = None
@@ -55,13 +58,21 @@ class Inputs:
         """The scale, or the extent if there is none."""
         return self.extent if self.scale is None else self.scale
 
+    def light_factor(self, index: int, factor: int) -> Tensor | None:
+        """The factor of the render of view ``index`` at 1 / ``factor`` of its size: (3,), or
+        (H, W, 3) where it varies over the image; None for 1."""
+        if self.light is None:
+            return None
+        view = self.views[index]
+        return torch.from_numpy(self.light[index].factor(view, reduced_size(view, factor)))
+
     def without(self, views: Collection[int]) -> Inputs:
         """The same without the views with these indices."""
         kept = [index for index in range(len(self.views)) if index not in views]
         return replace(
             self,
             views=[self.views[index] for index in kept],
-            gains=None if self.gains is None else self.gains[kept],
+            light=None if self.light is None else [self.light[index] for index in kept],
             embeddings=None if self.embeddings is None else self.embeddings[kept],
             depths=None if self.depths is None else [self.depths[index] for index in kept],
             empty_depths=None if self.empty_depths is None else self.empty_depths[kept],

@@ -46,6 +46,16 @@ class TrainCounters(StageCounters):
         description="Standard deviation of the photographs' exposures, stops; absent unless "
         "`train.appearance` is `measured`, and for photographs with alpha.",
     )
+    vignetting_stops: float | None = Field(
+        None,
+        description="Stops by which corners are darker than the centre of the image, for the "
+        "camera with the strongest vignetting; absent unless vignetting is modelled.",
+    )
+    slope_stops: float | None = Field(
+        None,
+        description="Change of brightness from the centre to the corner by the photographs' "
+        "slopes, root mean square, stops; absent unless slopes are modelled.",
+    )
     colour_disagreement: float | None = Field(
         None,
         description="Standard deviation of log2 of the colours of a point over the photographs, "

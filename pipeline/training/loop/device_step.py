@@ -93,14 +93,12 @@ class DeviceStep(StepEngine):
         fixed = target.alpha is None or self.scene.background != "random"
         transients = self.state.transients
         version = 0 if transients is None else transients.version
-        red, green, blue = (
-            (1.0, 1.0, 1.0) if self.scene.gains is None else self.scene.gains[view.index].tolist()
-        )
+        light = self.scene.inputs.light
         return ResidentImage(
             key=(view.index, view.factor, version) if fixed else None,
             target=target.over(view.background),
             mask=target.ignored,
-            gain=(red, green, blue),
+            gain=(1.0, 1.0, 1.0) if light is None else light[view.index].gain,
             surroundings=target.surroundings,
         )
 

@@ -25,7 +25,7 @@ class OperatorStep(StepEngine):
         self.color_loss = ColorLoss(
             run.options.ssim_loss_weight,
             run.options.experiments.squared_error_loss_weight,
-            scene.gains,
+            scene.inputs.light_factor,
             backend,
             run.threads,
         )

@@ -9,7 +9,6 @@ from itertools import islice
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pipeline.plan.training_memory import machine_mb, memory_mb
 from pipeline.render import Backend, RasterCamera
@@ -41,7 +40,6 @@ class TrainingScene:
     Attributes:
         inputs: The inputs without views that their masks hide completely.
         targets: The pixels of ``inputs.views``.
-        gains: (V, 3) float32 factors of the renders, or None.
         background: The background: black, white or random.
         near: The near plane, world units.
         sky: The skybox, None without one.
@@ -49,7 +47,6 @@ class TrainingScene:
 
     inputs: Inputs
     targets: Targets
-    gains: Tensor | None
     background: str
     near: float
     sky: Sky | None
@@ -83,8 +80,7 @@ def load_scene(inputs: Inputs, run: TrainingRun, warn: Warn) -> TrainingScene:
     if background in SKYBOXES:
         background = "black"  # Behind the Gaussians of the skybox.
         sky = Sky(np.array([view.centre for view in inputs.views]))
-    gains = None if inputs.gains is None else torch.from_numpy(inputs.gains.astype(np.float32))
-    return TrainingScene(inputs, targets, gains, background, near, sky)
+    return TrainingScene(inputs, targets, background, near, sky)
 
 
 def read_targets(inputs: Inputs, run: TrainingRun) -> Targets:

@@ -233,7 +233,7 @@ class Trainer:
             [self.camera(index, factor) for index in range(len(scene.views))],
             lambda index: scene.targets.reduced(index, factor),
             shown,
-            scene.gains,
+            lambda index: scene.inputs.light_factor(index, factor),
             self.raster_options(BACKGROUNDS.get(scene.background, BACKGROUNDS["black"])),
             self.backend,
         )
@@ -278,8 +278,11 @@ def make_engine(
     schedule: Schedule,
 ) -> StepEngine:
     """Steps on the backend's device, or by its operators if that is the CPU or if the strategy
-    needs more in a step than devices do: losses of its own, noise or drop-out."""
-    operators = state.density.statistics is None or schedule.dropout > 0
+    needs more in a step than devices do: losses of its own, noise, drop-out, or light that varies
+    over the image."""
+    light = scene.inputs.light or ()
+    uniform = all(of.is_uniform for of in light)
+    operators = state.density.statistics is None or schedule.dropout > 0 or not uniform
     training = None if operators else backend.resident()
     if training is None:
         return OperatorStep(scene, state, run, backend)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -33,12 +34,12 @@ class ColorLoss:
 
     Attributes:
         ssim_weight, squared_error_weight: See ``Backend.l1_ssim``.
-        gains: (V, 3) factors of the renders; None: all 1.
+        light_factor: The factor of a view's render (``Inputs.light_factor``).
     """
 
     ssim_weight: float
     squared_error_weight: float
-    gains: Tensor | None
+    light_factor: Callable[[int, int], Tensor | None]
     backend: Backend
     threads: int
 
@@ -48,12 +49,12 @@ class ColorLoss:
         """Compare a render with its photograph."""
         target, around = view.target, view.target.surroundings
         image = target.over(view.background)
-        gain = None if self.gains is None else self.gains[view.index]
+        factor = self.light_factor(view.index, view.factor)
         color = rendered.color
         if around is not None:
             color = self.backend.compose(around, color, rendered.alpha, self.threads)
-        if gain is not None:
-            color = color * gain
+        if factor is not None:
+            color = color * factor
         loss = self.backend.l1_ssim(
             color,
             image,
@@ -63,7 +64,7 @@ class ColorLoss:
             self.threads,
         )
         psnr = target.psnr(color, image) if measures_psnr else None
-        d_color, d_alpha = loss.grad if gain is None else loss.grad * gain, None
+        d_color, d_alpha = loss.grad if factor is None else loss.grad * factor, None
         if around is not None:
             d_color, d_alpha = self.backend.compose_backward(
                 around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads

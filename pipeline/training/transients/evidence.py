@@ -57,27 +57,27 @@ class ReducedPhotographs:
         cameras: The cameras.
         target: The pixels of a view by its index.
         shown: The Gaussians in the colours of a view by its index.
-        gains: (V, 3) factors of the renders; None: all 1.
+        light_factor: The factor of a view's render by its index (``Inputs.light_factor``).
         options: The options of training.
     """
 
     cameras: Sequence[RasterCamera]
     target: Callable[[int], Target]
     shown: Callable[[int], Gaussians]
-    gains: Tensor | None
+    light_factor: Callable[[int], Tensor | None]
     options: RasterOptions
     backend: Backend
 
     def render(self, index: int) -> Forward:
-        """The render of a view, without gains."""
+        """The render of a view, without its light."""
         parameters = self.shown(index).parameters()
         return self.backend.forward(*parameters, self.cameras[index], self.options)
 
     def compare(self, index: int, rendered: Forward) -> Comparison:
         """Compare the render of a view with its photograph."""
         target, color = self.target(index), rendered.color
-        if self.gains is not None:
-            color = color * self.gains[index]
+        if (factor := self.light_factor(index)) is not None:
+            color = color * factor
         color, image = color.clamp(0.0, 1.0), target.rgb.to(torch.float32) / 255.0
         difference = (color - image).abs().mean(2)
         if target.ignored is not None:

@@ -10,7 +10,7 @@ import torch
 
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import raster_camera
-from pipeline.scene.exposure import ExposureGains
+from pipeline.scene.exposure import ExposureGains, ViewLight
 from pipeline.training.blocks.options import FIRST, SECOND, corrected_box
 from pipeline.training.blocks.shares import IMAGE_FACTOR
 from pipeline.training.run import Part
@@ -110,7 +110,7 @@ def test_pixels_of_other_blocks_have_the_exposure_of_their_view(divided: Divided
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
     view = divided.views[1]
     plain = layers_of(divided.gaussians, divided.partition, 1, options)
-    gains = ExposureGains({view.name: (0.5, 0.25, 0.75)})
+    gains = ExposureGains({view.name: ViewLight(gain=(0.5, 0.25, 0.75))})
     exposed = replace(plain, gains=gains)
     factor = torch.tensor([0.5, 0.25, 0.75])
     difference = exposed(view).coarse - plain(view).coarse * factor

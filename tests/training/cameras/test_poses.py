@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from pipeline.render import RasterOptions
+from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View
 from pipeline.training.cameras.fit_pose import fit_pose
 from pipeline.training.cameras.poses import rigid, with_common_motion
@@ -52,10 +53,10 @@ def test_a_test_view_is_aligned_to_its_photograph(scene: TinyScene, index: int) 
     photo = np.asarray(Image.open(view.image))
     mask = np.ones(photo.shape[:2], bool)
     mask[:3] = False
-    gain = [0.5, 1.0, 1.25]
-    seen = np.minimum(np.rint(photo * np.array(gain)), 255).astype(np.uint8)
+    light = ViewLight(gain=(0.5, 1.0, 1.25), slope=(0.2, 0.1))
+    seen = np.minimum(np.rint(photo * light.factor(view)), 255).astype(np.uint8)
     found = fit_pose(
-        scene.truth, wrong, seen, mask, gain, RasterOptions(1, threads=1), scene.extent, 0.2
+        scene.truth, wrong, seen, mask, light, RasterOptions(1, threads=1), scene.extent, 0.2
     )
     assert distance(found, view) < 0.05 * distance(wrong, view)
 

@@ -6,11 +6,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from pipeline.render import make_backend
+from pipeline.scene.exposure import ViewLight
 from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.strategy import rotations
@@ -72,7 +72,7 @@ def test_each_parameter_has_its_own_learning_rate(
 def test_the_gradient_is_that_of_the_loss(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With exposure gains, against finite differences of the image."""
+    """With exposure gains, vignetting and a slope, against finite differences of the image."""
     seen: dict[str, Any] = {}
     backward, loss = make_backend().backward, make_backend().l1_ssim
 
@@ -86,15 +86,15 @@ def test_the_gradient_is_that_of_the_loss(
 
     monkeypatch.setattr(make_backend(), "backward", watched_backward)
     monkeypatch.setattr(make_backend(), "l1_ssim", watched_loss)
-    gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
+    light = [ViewLight(gain=(0.4, 1.0, 2.5), vignetting=(-0.5, -0.3), slope=(0.4, -0.6))]
     train(
-        Inputs(scene.views, scene.initial, scene.extent, gains=gains),
+        Inputs(scene.views, scene.initial, scene.extent, light=light * len(scene.views)),
         TrainingRun(tiny_config(1), tmp_path, seed=0, threads=1),
     )
-    gain = torch.tensor(gains[0], dtype=torch.float32)
+    factor = torch.from_numpy(light[0].factor(scene.views[0]))
 
     def measured(picture: torch.Tensor) -> float:
-        return make_backend().l1_ssim(picture * gain, *seen["wanted_and_weights"]).loss
+        return make_backend().l1_ssim(picture * factor, *seen["wanted_and_weights"]).loss
 
     for channel in range(3):
         step = torch.zeros_like(seen["color"])

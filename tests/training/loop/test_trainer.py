@@ -19,6 +19,7 @@ from pipeline.io.npz import write_npz
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
+from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import InitGaussians
@@ -348,7 +349,8 @@ def test_gains_compensate_for_different_exposures(scene: TinyScene, tmp_path: Pa
     config = tiny_config(150)
 
     def trained(name: str, gains: NDArray[np.float64] | None) -> TrainResult:
-        inputs = Inputs(views, scene.initial, scene.extent, gains=gains)
+        light = None if gains is None else [ViewLight(gain=tuple(gain)) for gain in gains]
+        inputs = Inputs(views, scene.initial, scene.extent, light=light)
         return train(inputs, TrainingRun(config, tmp_path / name, seed=0, threads=1))
 
     with_gains, without = trained("a", gains), trained("b", None)

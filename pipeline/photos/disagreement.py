@@ -11,6 +11,7 @@ nothing occludes a point in one of these photographs alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -33,6 +34,20 @@ TO_DEVIATION = 1.4826
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class ObservedColours:
+    """Colours of points in photographs.
+
+    Attributes:
+        point, view: (M,) indices of the point and the view of each observation.
+        colours: (M, 3) log2 of the colours.
+    """
+
+    point: NDArray[np.int64]
+    view: NDArray[np.int64]
+    colours: Array
+
+
 def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Array) -> float:
     """The robust standard deviation of log2 of the colours of a point over the photographs, after
     gains that compensate exposure and white balance; the median over a sample of the views. The
@@ -43,6 +58,18 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
         points: The (N, 3) points of the scene, for a model without points.
     """
     views = sample_views(views)
+    found = observed_colours(views, model, points)
+    return _spread(found.point, found.view, found.colours, len(views)) if len(found.point) else 0.0
+
+
+def observed_colours(
+    views: Sequence[View], model: Reconstruction, points: Array
+) -> ObservedColours:
+    """The colours of points in the views that observe them.
+
+    Args:
+        views, points: See ``colour_disagreement``.
+    """
     tracked = len(model.points) > 0
     means = np.asarray(model.points.xyz if tracked else points, np.float64)
     observed = _tracks(views, model) if tracked else None
@@ -66,9 +93,10 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
         view_index.append(np.full(len(values), index))
         colours.append(values)
     if not point:
-        return 0.0
-    return _spread(
-        np.concatenate(point), np.concatenate(view_index), np.concatenate(colours), len(views)
+        nothing = np.zeros(0, np.int64)
+        return ObservedColours(nothing, nothing, np.zeros((0, 3)))
+    return ObservedColours(
+        np.concatenate(point), np.concatenate(view_index), np.concatenate(colours)
     )
 
 

@@ -29,7 +29,8 @@ class AppearanceChoice:
     """How the colours of photographs differ.
 
     Attributes:
-        gains: The exposure gains of all views; empty if exposure is not modelled.
+        gains: The exposure gains of all views, with embeddings of the training views alone; empty
+            if exposure is not modelled.
         embeddings: Whether views have appearance embeddings.
         decisions: The sentences for the user.
         counters: The measured values by the names of their counters.
@@ -62,10 +63,12 @@ def choose_appearance(
         in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
     choice = AppearanceChoice(embeddings=wanted == "embedding")
+    training = [view for view in views if not view.is_test]
+    if choice.embeddings and not has_alpha:
+        choice.gains = _gains_besides_embeddings(training, model)
     if wanted in ("none", "embedding") or has_alpha:
         return choice
     if wanted == "measured" and not in_blocks:
-        training = [view for view in views if not view.is_test]
         disagreement = colour_disagreement(training, model, points)
         choice.counters["colour_disagreement"] = round(disagreement, 4)
         collection = is_collection(cameras)
@@ -76,6 +79,7 @@ def choose_appearance(
                 f"photographs disagree on colours after exposure (by {disagreement:.2f} in log2): "
                 "each has an appearance embedding (train.appearance)"
             )
+            choice.gains = _gains_besides_embeddings(training, model)
             return choice
     if wanted == "measured":
         spread = measure_exposures(sample_views(views), model).spread
@@ -88,6 +92,16 @@ def choose_appearance(
         f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
         f"measured in {found.measured} of {photographs} photographs"
     )
-    names = [view.name for view in views]
-    choice.gains = ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
+    choice.gains = _by_name(views, found.gains)
     return choice
+
+
+def _gains_besides_embeddings(training: Sequence[View], model: Reconstruction) -> ExposureGains:
+    """The gains of the training views. Those of other views are fitted with their embeddings
+    (``appearance.fit``): measured ones would show what the measured half of the photograph is."""
+    return _by_name(training, measure_exposures(training, model).gains)
+
+
+def _by_name(views: Sequence[View], gains: NDArray[np.float64]) -> ExposureGains:
+    names = [view.name for view in views]
+    return ExposureGains(dict(zip(names, gains.tolist(), strict=True)))

@@ -48,10 +48,25 @@ class ObservedColours:
     colours: Array
 
 
-def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Array) -> float:
-    """The robust standard deviation of log2 of the colours of a point over the photographs, after
-    gains that compensate exposure and white balance; the median over a sample of the views. The
-    value is 0 if too few points are seen by several views.
+@dataclass(frozen=True)
+class ColourDisagreement:
+    """How far photographs disagree on colours.
+
+    Attributes:
+        value: The robust standard deviation of log2 of the colours of a point over the photographs,
+            after gains that compensate exposure and white balance; the median over the measured
+            views, 0 without any.
+        measured: The share of a sample of the views that see enough points which other views see.
+    """
+
+    value: float
+    measured: float
+
+
+def colour_disagreement(
+    views: Sequence[View], model: Reconstruction, points: Array
+) -> ColourDisagreement:
+    """Measure the disagreement on a sample of the views.
 
     Args:
         views: The views of images of ``model``, matched by name.
@@ -59,7 +74,9 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
     """
     views = sample_views(views)
     found = observed_colours(views, model, points)
-    return _spread(found.point, found.view, found.colours, len(views)) if len(found.point) else 0.0
+    if not len(found.point):
+        return ColourDisagreement(0.0, 0.0)
+    return _spread(found.point, found.view, found.colours, len(views))
 
 
 def observed_colours(
@@ -100,13 +117,15 @@ def observed_colours(
     )
 
 
-def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> float:
-    """The value of ``colour_disagreement``; the arguments are those of ``solve_gains``."""
+def _spread(
+    point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
+) -> ColourDisagreement:
+    """The disagreement; the arguments are those of ``solve_gains``."""
     _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
     several = observed[point] >= 2
     point, view, y = point[several], view[several], y[several]
     if not len(point):
-        return 0.0
+        return ColourDisagreement(0.0, 0.0)
     y = y - np.log2(solve_gains(point, view, y, count).gains)[view]
     _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(point, y[:, c]) for c in range(3)], axis=1) / observed[:, None]
@@ -114,7 +133,8 @@ def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: 
     residual = (y - means[point]) * np.sqrt(observed / (observed - 1.0))[point][:, None]
     of_views = [residual[view == v] for v in range(count)]
     found = [np.median(np.abs(r)) for r in of_views if len(r) >= MIN_OBSERVATIONS]
-    return float(np.median(found)) * TO_DEVIATION if found else 0.0
+    value = float(np.median(found)) * TO_DEVIATION if found else 0.0
+    return ColourDisagreement(value, len(found) / count)
 
 
 def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int64]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.photos.disagreement import colour_disagreement
+from pipeline.photos.disagreement import ColourDisagreement, colour_disagreement
 from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.scene.collection import is_collection
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
@@ -22,6 +22,9 @@ EXPOSURES_DIFFER = 0.2
 # different light. Of one camera on one day it is up to 0.1, or 0.2 where points are inaccurate (a
 # street driven along); with another light, 0.6. In collections by many cameras it is 0.15 or more.
 COLOURS_DISAGREE, COLOURS_OF_COLLECTION_DISAGREE = 0.3, 0.13
+# In a collection, photographs are taken to be in different light if fewer than this share of them
+# can be compared: those in one light have matches, and so common points.
+MEASURED_SHARE = 0.5
 
 
 @dataclass
@@ -68,16 +71,22 @@ def choose_appearance(
         choice.gains = _gains_besides_embeddings(training, model)
     if wanted in ("none", "embedding") or has_alpha:
         return choice
+    collection = is_collection(cameras)
+    if wanted == "measured" and in_blocks and collection:
+        choice.decisions.append(
+            "photographs by many cameras may be in different light, but a scene in blocks has no "
+            "appearance embeddings: those of different blocks would not agree "
+            "(partition.blocks: 1 allows them)"
+        )
     if wanted == "measured" and not in_blocks:
-        disagreement = colour_disagreement(training, model, points)
-        choice.counters["colour_disagreement"] = round(disagreement, 4)
-        collection = is_collection(cameras)
-        limit = COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE
-        if disagreement > limit:
+        found = colour_disagreement(training, model, points)
+        choice.counters["colour_disagreement"] = round(found.value, 4)
+        if reason := _reason_for_embeddings(found, collection):
             choice.embeddings = True
             choice.decisions.append(
-                f"photographs disagree on colours after exposure (by {disagreement:.2f} in log2): "
-                "each has an appearance embedding (train.appearance)"
+                f"{reason}: each has an appearance embedding (train.appearance); the scene's own "
+                "colours, which are exported, are those of the mean embedding and of the typical "
+                "exposure"
             )
             choice.gains = _gains_besides_embeddings(training, model)
             return choice
@@ -86,14 +95,26 @@ def choose_appearance(
         choice.counters["exposure_spread_stops"] = round(spread, 4)
         if spread < EXPOSURES_DIFFER:
             return choice
-    found = measure_exposures(views, model)
+    exposures = measure_exposures(views, model)
     photographs = len({view.source or view.name for view in views})
     choice.decisions.append(
-        f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
-        f"measured in {found.measured} of {photographs} photographs"
+        f"exposures differ by {exposures.spread:.2f} stops: renders are multiplied by gains that "
+        f"were measured in {exposures.measured} of {photographs} photographs"
     )
-    choice.gains = _by_name(views, found.gains)
+    choice.gains = _by_name(views, exposures.gains)
     return choice
+
+
+def _reason_for_embeddings(found: ColourDisagreement, collection: bool) -> str | None:
+    """Why photographs need embeddings; None if they do not."""
+    if collection and found.measured < MEASURED_SHARE:
+        return (
+            "photographs by many cameras see too few common points to compare their light "
+            f"({found.measured:.0%} of them see enough)"
+        )
+    if found.value > (COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE):
+        return f"photographs disagree on colours after exposure (by {found.value:.2f} in log2)"
+    return None
 
 
 def _gains_besides_embeddings(training: Sequence[View], model: Reconstruction) -> ExposureGains:

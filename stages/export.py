@@ -44,6 +44,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
+    from pipeline.io.appearance_files import Embeddings
     from pipeline.render.registry import use_device
     from pipeline.scene.blocks import Partition
     from pipeline.scene.unrounded import Unrounded
@@ -78,6 +79,11 @@ def work(job: Job) -> None:
         split,
         threads=job.threads,
     )
+    if (job.inputs["train"] / Embeddings.file_name).is_file():
+        job.decide(
+            "photographs differ in their light: the exported colours are those of the mean of "
+            "their appearance embeddings and of their typical exposure"
+        )
     job.record(report.counters, report.decisions, report.warnings)
 
 

@@ -1,7 +1,7 @@
 """The appearance of a trained scene in photographs: ``appearance.json`` and ``appearance.npz``.
 
-The first has the embeddings of the training photographs by name, the second the colours of the
-Gaussians, in the order of ``gaussians.npz``.
+The first has the embeddings and the gains of the training photographs by name, the second the
+colours of the Gaussians, in the order of ``gaussians.npz``.
 """
 
 from __future__ import annotations
@@ -10,25 +10,39 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from pydantic import RootModel
+from pydantic import BaseModel, ConfigDict, RootModel
 
 from pipeline.io.arrays import read_archive, write_arrays
 from pipeline.io.bounded import opened_regular
-from pipeline.runtime.json_file import JsonFile, mismatch
+from pipeline.runtime.json_file import JsonFile, Vector3, mismatch
 from pipeline.scene.appearance import Appearance
 
 COLORS = "appearance.npz"
 
 
-class Embeddings(JsonFile, RootModel[dict[str, tuple[float, ...]]]):
-    """The appearance embedding of each training view by name, of mean 0."""
+class PhotographAppearance(BaseModel):
+    """The appearance of a photograph."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    embedding: tuple[float, ...]
+    """The appearance embedding; the mean over the photographs is 0."""
+    gain: Vector3 | None
+    """Factors of the colours by exposure and white balance; null if there are none."""
+
+
+class Embeddings(JsonFile, RootModel[dict[str, PhotographAppearance]]):
+    """The appearance of each training view by name."""
 
     file_name: ClassVar[str] = "appearance.json"
 
 
 def write_appearance(folder: Path, appearance: Appearance) -> None:
     """Write the files into ``folder``."""
-    named = {name: tuple(values.tolist()) for name, values in appearance.embeddings.items()}
+    named = {}
+    for name, values in appearance.embeddings.items():
+        gain = appearance.gains[name].tolist() if appearance.gains else None
+        named[name] = PhotographAppearance(embedding=tuple(values.tolist()), gain=gain)
     Embeddings(named).write(folder)
     write_arrays(folder / COLORS, {"colors": appearance.colors})
 
@@ -56,6 +70,13 @@ def read_appearance(folder: Path, gaussians: int) -> Appearance | None:
         raise mismatch(
             file, f"expected colours of {gaussians} Gaussians, found an array {colors.shape}"
         )
-    if not named or any(len(values) != size for values in named.values()):
+    if not named or any(len(found.embedding) != size for found in named.values()):
         raise mismatch(folder / Embeddings.file_name, f"expected embeddings of {size} numbers each")
-    return Appearance(colors, {name: np.array(values) for name, values in named.items()})
+    gains = {name: found.gain for name, found in named.items() if found.gain is not None}
+    if gains and len(gains) < len(named):
+        raise mismatch(folder / Embeddings.file_name, "expected gains of all views or of none")
+    return Appearance(
+        colors,
+        {name: np.array(found.embedding) for name, found in named.items()},
+        {name: np.array(gain) for name, gain in gains.items()},
+    )

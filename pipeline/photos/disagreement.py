@@ -11,6 +11,7 @@ nothing occludes a point in one of these photographs alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -33,16 +34,59 @@ TO_DEVIATION = 1.4826
 Array = NDArray[np.float64]
 
 
-def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Array) -> float:
-    """The robust standard deviation of log2 of the colours of a point over the photographs, after
-    gains that compensate exposure and white balance; the median over a sample of the views. The
-    value is 0 if too few points are seen by several views.
+@dataclass(frozen=True)
+class ObservedColours:
+    """Colours of points in photographs.
+
+    Attributes:
+        point, view: (M,) indices of the point and the view of each observation.
+        colours: (M, 3) log2 of the colours.
+    """
+
+    point: NDArray[np.int64]
+    view: NDArray[np.int64]
+    colours: Array
+
+
+@dataclass(frozen=True)
+class ColourDisagreement:
+    """How far photographs disagree on colours.
+
+    Attributes:
+        value: The robust standard deviation of log2 of the colours of a point over the photographs,
+            after gains that compensate exposure and white balance; the median over the measured
+            views, 0 without any.
+        measured: The share of a sample of the views that see enough points which other views see.
+    """
+
+    value: float
+    measured: float
+
+
+def colour_disagreement(
+    views: Sequence[View], model: Reconstruction, points: Array
+) -> ColourDisagreement:
+    """Measure the disagreement on a sample of the views.
 
     Args:
         views: The views of images of ``model``, matched by name.
         points: The (N, 3) points of the scene, for a model without points.
     """
     views = sample_views(views)
+    found = observed_colours(views, model, points)
+    if not len(found.point):
+        return ColourDisagreement(0.0, 0.0)
+    return _spread(found.point, found.view, found.colours, len(views))
+
+
+def observed_colours(
+    views: Sequence[View], model: Reconstruction, points: Array
+) -> ObservedColours:
+    """The colours of points in the views that observe them.
+
+    Args:
+        views, points: See ``colour_disagreement``.
+    """
     tracked = len(model.points) > 0
     means = np.asarray(model.points.xyz if tracked else points, np.float64)
     observed = _tracks(views, model) if tracked else None
@@ -66,19 +110,22 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
         view_index.append(np.full(len(values), index))
         colours.append(values)
     if not point:
-        return 0.0
-    return _spread(
-        np.concatenate(point), np.concatenate(view_index), np.concatenate(colours), len(views)
+        nothing = np.zeros(0, np.int64)
+        return ObservedColours(nothing, nothing, np.zeros((0, 3)))
+    return ObservedColours(
+        np.concatenate(point), np.concatenate(view_index), np.concatenate(colours)
     )
 
 
-def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> float:
-    """The value of ``colour_disagreement``; the arguments are those of ``solve_gains``."""
+def _spread(
+    point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
+) -> ColourDisagreement:
+    """The disagreement; the arguments are those of ``solve_gains``."""
     _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
     several = observed[point] >= 2
     point, view, y = point[several], view[several], y[several]
     if not len(point):
-        return 0.0
+        return ColourDisagreement(0.0, 0.0)
     y = y - np.log2(solve_gains(point, view, y, count).gains)[view]
     _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(point, y[:, c]) for c in range(3)], axis=1) / observed[:, None]
@@ -86,7 +133,8 @@ def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: 
     residual = (y - means[point]) * np.sqrt(observed / (observed - 1.0))[point][:, None]
     of_views = [residual[view == v] for v in range(count)]
     found = [np.median(np.abs(r)) for r in of_views if len(r) >= MIN_OBSERVATIONS]
-    return float(np.median(found)) * TO_DEVIATION if found else 0.0
+    value = float(np.median(found)) * TO_DEVIATION if found else 0.0
+    return ColourDisagreement(value, len(found) / count)
 
 
 def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int64]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,13 @@ class Appearance:
     Attributes:
         colors: (N, K, 3) float32, added to SH coefficient 0 in proportion to an embedding.
         embeddings: (K,) embedding of each training view by name, of mean 0.
+        gains: (3,) factor of the colours in each training view by name: its exposure and white
+            balance, relative to the scene's typical ones. Empty if there are none.
     """
 
     colors: NDArray[np.float32]
     embeddings: dict[str, NDArray[np.float64]]
+    gains: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def fitted_columns(width: int) -> int:

@@ -106,9 +106,14 @@ def train_scene(
     notes.decisions += appearance.decisions
     notes.counters |= appearance.counters
     inputs = scene_inputs(scene, initial, run, appearance.gains, notes, dense)
+    gains = appearance.gains
     if appearance.embeddings:
         size = run.options.experiments.appearance_size
-        inputs = replace(inputs, embeddings=initial_embeddings(inputs.views, size))
+        start = initial_embeddings(
+            inputs.views, scene.model, initial.means.double().numpy(), inputs.gains, size
+        )
+        # Gains are then a part of the appearance (``Appearance.gains``).
+        inputs, gains = replace(inputs, embeddings=start), NO_GAINS
     trained = run_training(inputs, run, notes)
     result, refined = trained.result, scene.model
     if result.intrinsics is not None:
@@ -118,7 +123,7 @@ def train_scene(
         refined = with_poses(refined, with_common_motion(scene.views, result.poses))
         trained.decisions.append(describe_poses(scene.views, result.poses))
     model = None if refined is scene.model else refined
-    return replace(trained, model=model, gains=appearance.gains)
+    return replace(trained, model=model, gains=gains)
 
 
 def run_training(inputs: Inputs, run: TrainingRun, notes: Notes | None = None) -> TrainedScene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +19,19 @@ APPEARANCE = Appearance(
 )
 
 
-def test_it_is_read_as_it_was_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gains", [{}, {"a.jpg": np.ones(3), "b.jpg": np.array([0.5, 2, 1 / 3])}])
+def test_it_is_read_as_it_was_written(tmp_path: Path, gains: dict[str, np.ndarray]) -> None:
     assert read_appearance(tmp_path, 5) is None
-    write_appearance(tmp_path, APPEARANCE)
+    write_appearance(tmp_path, replace(APPEARANCE, gains=gains))
     found = read_appearance(tmp_path, 5)
     assert found is not None
     assert np.array_equal(found.colors, APPEARANCE.colors)
     assert list(found.embeddings) == ["a.jpg", "b.jpg"]
     for name, values in APPEARANCE.embeddings.items():
         assert np.array_equal(found.embeddings[name], values)
+    assert found.gains.keys() == gains.keys()
+    for name, values in gains.items():
+        assert np.array_equal(found.gains[name], values)
 
 
 def test_damaged_files_and_those_of_other_scenes_are_errors(tmp_path: Path) -> None:
@@ -41,6 +46,13 @@ def test_damaged_files_and_those_of_other_scenes_are_errors(tmp_path: Path) -> N
         read_appearance(tmp_path, 5)
     (tmp_path / COLORS).unlink()
     with pytest.raises(UserError, match=r"appearance\.npz"):
+        read_appearance(tmp_path, 5)
+    some = (
+        '{"a": {"embedding": [1, 2], "gain": [1, 1, 1]}, "b": {"embedding": [1, 2], "gain": null}}'
+    )
+    write_appearance(tmp_path, APPEARANCE)
+    (tmp_path / "appearance.json").write_text(some)
+    with pytest.raises(UserError, match="expected gains of all views or of none"):
         read_appearance(tmp_path, 5)
     (tmp_path / "appearance.json").write_text('{"a.jpg": "x"}')
     with pytest.raises(UserError, match=r"appearance\.json"):

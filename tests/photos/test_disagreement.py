@@ -64,23 +64,23 @@ def photographs(folder, lights, gains, *, tracks="all", shift=0.0):
 
 def test_exposure_and_white_balance_are_no_disagreement(tmp_path):
     gains = 2.0 ** np.random.default_rng(1).uniform(-0.5, 0.5, (8, 3))
-    assert colour_disagreement(*photographs(tmp_path, [0] * 8, gains)) < 0.03
+    assert colour_disagreement(*photographs(tmp_path, [0] * 8, gains)).value < 0.03
 
 
 def test_other_lights_are(tmp_path):
     ones = np.ones((8, 3))
-    assert colour_disagreement(*photographs(tmp_path, [0, 1] * 4, ones)) > 2 * LIMIT
+    assert colour_disagreement(*photographs(tmp_path, [0, 1] * 4, ones)).value > 2 * LIMIT
     one = photographs(tmp_path, [0] * 7 + [1], ones)
-    assert colour_disagreement(*one) < LIMIT, "a single photograph in another light"
+    assert colour_disagreement(*one).value < LIMIT, "a single photograph in another light"
 
 
 def test_photographs_from_the_same_place_need_no_common_tracks(tmp_path):
     ones = np.ones((8, 3))
     for tracks in ("light", "none"):
         same = photographs(tmp_path, [0, 1] * 4, ones, tracks=tracks)
-        assert colour_disagreement(*same) > 2 * LIMIT
+        assert colour_disagreement(*same).value > 2 * LIMIT
     apart = photographs(tmp_path, [0, 1] * 4, ones, tracks="none", shift=0.1)
-    assert colour_disagreement(*apart) == 0
+    assert colour_disagreement(*apart).value == 0
 
 
 def test_masked_points_are_not_compared(tmp_path):
@@ -91,4 +91,4 @@ def test_masked_points_are_not_compared(tmp_path):
             "width", "height", "fx", "fy", "cx", "cy", "world_to_camera", "is_test")])
         for v in views
     ]  # fmt: skip
-    assert colour_disagreement(masked, model, points) == 0
+    assert colour_disagreement(masked, model, points).value == 0

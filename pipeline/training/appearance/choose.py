@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.photos.disagreement import colour_disagreement
+from pipeline.photos.disagreement import ColourDisagreement, colour_disagreement
 from pipeline.photos.exposure import observe, sample_views, solve_gains
 from pipeline.photos.shading import (
     Parts,
@@ -19,7 +19,7 @@ from pipeline.photos.shading import (
     without_gains,
 )
 from pipeline.scene.collection import is_collection
-from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.exposure import NO_GAINS, ExposureGains, ViewLight
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
@@ -30,6 +30,9 @@ EXPOSURES_DIFFER = 0.2
 # different light. Of one camera on one day it is up to 0.1, or 0.2 where points are inaccurate (a
 # street driven along); with another light, 0.6. In collections by many cameras it is 0.15 or more.
 COLOURS_DISAGREE, COLOURS_OF_COLLECTION_DISAGREE = 0.3, 0.13
+# In a collection, photographs are taken to be in different light if fewer than this share of them
+# can be compared: those in one light have matches, and so common points.
+MEASURED_SHARE = 0.5
 
 
 @dataclass
@@ -37,7 +40,8 @@ class AppearanceChoice:
     """How the colours of photographs differ.
 
     Attributes:
-        gains: The exposure gains of all views; empty if exposure is not modelled.
+        gains: The exposure gains of all views, with embeddings of the training views alone; empty
+            if exposure is not modelled.
         embeddings: Whether views have appearance embeddings.
         decisions: The sentences for the user.
         counters: The measured values by the names of their counters.
@@ -70,20 +74,29 @@ def choose_appearance(
         in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
     choice = AppearanceChoice(embeddings=wanted == "embedding")
+    training = [view for view in views if not view.is_test]
+    if choice.embeddings and not has_alpha:
+        choice.gains = _gains_besides_embeddings(training, model)
     if wanted in ("none", "embedding") or has_alpha:
         return choice
+    collection = is_collection(cameras)
+    if wanted == "measured" and in_blocks and collection:
+        choice.decisions.append(
+            "photographs by many cameras may be in different light, but a scene in blocks has no "
+            "appearance embeddings: those of different blocks would not agree "
+            "(partition.blocks: 1 allows them)"
+        )
     if wanted == "measured" and not in_blocks:
-        training = [view for view in views if not view.is_test]
-        disagreement = colour_disagreement(training, model, points)
-        choice.counters["colour_disagreement"] = round(disagreement, 4)
-        collection = is_collection(cameras)
-        limit = COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE
-        if disagreement > limit:
+        found = colour_disagreement(training, model, points)
+        choice.counters["colour_disagreement"] = round(found.value, 4)
+        if reason := _reason_for_embeddings(found, collection):
             choice.embeddings = True
             choice.decisions.append(
-                f"photographs disagree on colours after exposure (by {disagreement:.2f} in log2): "
-                "each has an appearance embedding (train.appearance)"
+                f"{reason}: each has an appearance embedding (train.appearance); the scene's own "
+                "colours, which are exported, are those of the mean embedding and of the typical "
+                "exposure"
             )
+            choice.gains = _gains_besides_embeddings(training, model)
             return choice
     _choose_light(choice, views, model, wanted)
     return choice
@@ -136,5 +149,28 @@ def _choose_light(
         + ("a photograph of typical exposure" if uses_gains else "the photographs")
         + (" at the centre of the image" if parts != Parts() else "")
     )
+    choice.gains = _by_name(views, light.of_views(seen))
+
+
+def _reason_for_embeddings(found: ColourDisagreement, collection: bool) -> str | None:
+    """Why photographs need embeddings; None if they do not."""
+    if collection and found.measured < MEASURED_SHARE:
+        return (
+            "photographs by many cameras see too few common points to compare their light "
+            f"({found.measured:.0%} of them see enough)"
+        )
+    if found.value > (COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE):
+        return f"photographs disagree on colours after exposure (by {found.value:.2f} in log2)"
+    return None
+
+
+def _gains_besides_embeddings(training: Sequence[View], model: Reconstruction) -> ExposureGains:
+    """The gains of the training views. Those of other views are fitted with their embeddings
+    (``appearance.fit``): measured ones would show what the measured half of the photograph is."""
+    seen = observe(training, model)
+    return _by_name(training, fit_light(seen, Parts()).of_views(seen))
+
+
+def _by_name(views: Sequence[View], light: Sequence[ViewLight]) -> ExposureGains:
     names = [view.name for view in views]
-    choice.gains = ExposureGains(dict(zip(names, light.of_views(seen), strict=True)))
+    return ExposureGains(dict(zip(names, light, strict=True)))

@@ -108,14 +108,17 @@ class AppearanceEmbeddings:
         """Update the embedding (K,) of view ``index`` by its gradient; ``rate`` as of ``step``."""
         self.embeddings[index] += self.adam.step(index, d_embedding, MAX_CHANGE * rate)
 
-    def centred(self, gaussians: Gaussians, names: Sequence[str]) -> tuple[Gaussians, Appearance]:
+    def centred(
+        self, gaussians: Gaussians, names: Sequence[str], gains: Array | None
+    ) -> tuple[Gaussians, Appearance]:
         """The same scene with embeddings of mean 0: the Gaussians in the colours of the mean
-        photograph, and their appearance in the views with these names."""
+        photograph, and their appearance in the views with these names and (V, 3) ``gains``."""
         assert gaussians.appearance is not None
         mean = self.embeddings.mean(0)
         appearance = Appearance(
             gaussians.appearance.numpy(),
             dict(zip(names, self.embeddings - mean, strict=True)),
+            {} if gains is None else dict(zip(names, gains, strict=True)),
         )
         return replace(with_appearance(gaussians, mean), appearance=None), appearance
 
@@ -149,9 +152,18 @@ def appearance_gradients(
     return np.array([np.sum(product) for product in products]), d_appearance
 
 
-def with_appearance(gaussians: Gaussians, embedding: Array) -> Gaussians:
-    """The Gaussians as a photograph with this embedding shows them."""
+def with_appearance(gaussians: Gaussians, embedding: Array, gain: Array | None = None) -> Gaussians:
+    """The Gaussians as a photograph with this embedding shows them.
+
+    Args:
+        gain: (3,) factors of the colours; None: all 1. A colour is ``0.5 + SH_C0 sh_0 + ...``,
+            clamped at 0, so that factors of colours are factors and offsets of the coefficients.
+    """
     assert gaussians.appearance is not None
     sh = gaussians.sh.clone()
     sh[:, 0] += colour_offsets(gaussians.appearance, embedding)
+    if gain is not None:
+        factors = torch.from_numpy(gain).float()
+        sh *= factors
+        sh[:, 0] += 0.5 / SH_C0 * (factors - 1)
     return replace(gaussians, sh=sh)

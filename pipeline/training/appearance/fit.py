@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 STEPS = 4
 # Difference of an embedding at which a render is linearised, in standard deviations.
 DIFFERENCE = 0.1
+# The smallest one: renders have single precision.
+MIN_DIFFERENCE = 1e-3
 # The prior has the deviations of the training photographs' embeddings; one deviation costs as much
 # as this sum of squared errors. It matters only where the fitted pixels hardly depend on a number
 # of the embedding.
@@ -44,55 +46,65 @@ def in_photograph(
         photo, mask: See ``fit_embedding``; the mask is False for ignored pixels.
     """
     gaussians = replace(gaussians, appearance=torch.from_numpy(appearance.colors))
-    embedding = appearance.embeddings.get(view.name)
+    embedding, gain = appearance.embeddings.get(view.name), appearance.gains.get(view.name)
     if embedding is None:
         left = np.zeros(photo.shape[:2], bool)
         left[:, : fitted_columns(photo.shape[1])] = True
         pixels = left if mask is None else left & mask
-        known = np.array(list(appearance.embeddings.values()))
-        embedding = fit_embedding(gaussians, view, photo, pixels, known, options, backend)
-    return replace(with_appearance(gaussians, embedding), appearance=None)
+        embedding, gain = fit_appearance(
+            gaussians, appearance, view, photo, pixels, options, backend
+        )
+    return replace(with_appearance(gaussians, embedding, gain), appearance=None)
 
 
-def fit_embedding(
+def fit_appearance(
     gaussians: Gaussians,
+    appearance: Appearance,
     view: View,
     photo: NDArray[np.uint8],
     pixels: NDArray[np.bool_],
-    known: Array,
     options: RasterOptions,
     backend: Backend | None = None,
-) -> Array:
-    """(K,) embedding with which the render is closest to some pixels of a photograph, by least
-    squares.
+) -> tuple[Array, Array | None]:
+    """The embedding (K,) and the gain (3,) with which the render is closest to some pixels of a
+    photograph, by least squares. The gain is None if the training photographs have none.
 
     Args:
         gaussians: The Gaussians with ``appearance``.
         photo: (H, W, 3) colours over the background of ``options``.
         pixels: (H, W) bool, True for the pixels to fit.
-        known: (V, K) embeddings of the training photographs, of mean 0.
         backend: The backend of the rasterizer; None: the default.
     """
     backend = backend or make_backend()
     options = limit_sh_degree(options, gaussians)
     camera, target = raster_camera(view), photo[pixels] / 255.0
-    deviations = np.sqrt((known**2).mean(0)) + 1e-6
+    known = np.array(list(appearance.embeddings.values()))
+    size = known.shape[1]
+    # The unknowns are the embedding, and the logarithms of the gain.
+    deviations = np.sqrt((known**2).mean(0))
+    if appearance.gains:
+        logarithms = np.log(np.array(list(appearance.gains.values())))
+        deviations = np.concatenate([deviations, np.sqrt((logarithms**2).mean(0))])
+    deviations = deviations + 1e-6
     prior = PRIOR / deviations**2
 
-    def render(embedding: Array) -> Array:
-        shown = with_appearance(gaussians, embedding)
+    def gain_of(unknowns: Array) -> Array | None:
+        return np.exp(unknowns[size:]) if len(unknowns) > size else None
+
+    def render(unknowns: Array) -> Array:
+        shown = with_appearance(gaussians, unknowns[:size], gain_of(unknowns))
         color = backend.forward(*shown.parameters(), camera, options).color.numpy()
         return color[pixels].astype(np.float64)
 
-    embedding = np.zeros(known.shape[1])
+    unknowns = np.zeros(len(deviations))
     for _ in range(STEPS):
-        now = render(embedding)
+        now = render(unknowns)
         slopes = [
-            (render(embedding + step) - now) / step.sum()
-            for step in np.diag(DIFFERENCE * deviations)
+            (render(unknowns + step) - now) / step.sum()
+            for step in np.diag(np.maximum(DIFFERENCE * deviations, MIN_DIFFERENCE))
         ]
         # Avoid matrix products: BLAS may round differently with the number of threads.
         normal = np.array([[np.sum(a * b) for b in slopes] for a in slopes])
         right = np.array([np.sum(a * (target - now)) for a in slopes])
-        embedding = embedding + np.linalg.solve(normal + np.diag(prior), right - prior * embedding)
-    return embedding
+        unknowns = unknowns + np.linalg.solve(normal + np.diag(prior), right - prior * unknowns)
+    return unknowns[:size], gain_of(unknowns)

@@ -58,6 +58,11 @@ class Inputs:
         """The scale, or the extent if there is none."""
         return self.extent if self.scale is None else self.scale
 
+    @property
+    def gains(self) -> NDArray[np.float64] | None:
+        """(V, 3) factors of the renders at the principal point; None if all are 1."""
+        return None if self.light is None else np.array([light.gain for light in self.light])
+
     def light_factor(self, index: int, factor: int) -> Tensor | None:
         """The factor of the render of view ``index`` at 1 / ``factor`` of its size: (3,), or
         (H, W, 3) where it varies over the image; None for 1."""

@@ -71,7 +71,7 @@ def result_of(
     names = [view.name for view in scene.views]
     gaussians, appearance = state.gaussians, None
     if state.appearance is not None:
-        gaussians, appearance = state.appearance.centred(gaussians, names)
+        gaussians, appearance = state.appearance.centred(gaussians, names, scene.inputs.gains)
     return TrainResult(
         gaussians=gaussians.with_sh_degree(sh_degree),
         curve=TrainingCurve(tuple(state.curve)),

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.photos.disagreement import ColourDisagreement
 from pipeline.training.appearance import choose as choose_module
 from pipeline.training.appearance.choose import AppearanceChoice, choose_appearance
 from tests.photos.test_disagreement import photographs
@@ -44,13 +45,13 @@ def test_photographs_choose_by_what_the_photographs_show(tmp_path: Path) -> None
     assert exposed.gains and not exposed.embeddings
     assert "exposures differ" in exposed.decisions[0]
     lights = choose(tmp_path, "measured", [0, 1] * 4, EXPOSED)
-    assert lights.embeddings and not lights.gains
+    assert lights.embeddings and lights.gains
     assert "train.appearance" in lights.decisions[0]
 
 
 @pytest.mark.parametrize(
     ("wanted", "gains", "embeddings"),
-    [("none", False, False), ("exposure", True, False), ("embedding", False, True)],
+    [("none", False, False), ("exposure", True, False), ("embedding", True, True)],
 )
 def test_a_chosen_model_is_used(tmp_path: Path, wanted: str, gains: bool, embeddings: bool) -> None:
     found = choose(tmp_path, wanted, [0, 1] * 4)
@@ -70,8 +71,27 @@ def test_a_collection_by_many_cameras_needs_less_evidence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: int
 ) -> None:
     """Where points are inaccurate, photographs of one camera disagree as well."""
-    monkeypatch.setattr(choose_module, "colour_disagreement", lambda *_: 0.2)
+    monkeypatch.setattr(
+        choose_module, "colour_disagreement", lambda *_: ColourDisagreement(0.2, 1.0)
+    )
     scene = photographs(tmp_path, [0] * 8, ALIKE)
     groups = [f"{number % cameras}" for number in range(8)]
     found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
     assert found.embeddings == (cameras == 8)
+
+
+@pytest.mark.parametrize("cameras", [1, 8])
+def test_a_collection_that_cannot_be_compared_has_embeddings(tmp_path: Path, cameras: int) -> None:
+    """Photographs of another time have few matches. One camera's are not suspected."""
+    scene = photographs(tmp_path, [0, 1] * 4, ALIKE, tracks="none", shift=0.05)
+    groups = [f"{number % cameras}" for number in range(8)]
+    found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
+    assert found.embeddings == (cameras == 8)
+    assert ("too few common points" in "".join(found.decisions)) == (cameras == 8)
+
+
+def test_a_collection_in_blocks_is_told_why_there_are_no_embeddings(tmp_path: Path) -> None:
+    scene = photographs(tmp_path, [0, 1] * 4, ALIKE)
+    groups = [str(number) for number in range(8)]
+    found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=True)
+    assert not found.embeddings and "partition.blocks: 1" in found.decisions[0]

@@ -49,6 +49,17 @@ def test_colours_equal_the_reference(gaussians: Gaussians) -> None:
     assert torch.allclose(offsets.double(), expected[:, 0] - gaussians.sh[:, 0], atol=1e-6)
 
 
+def test_a_gain_multiplies_the_render(gaussians: Gaussians) -> None:
+    """Also where colours are clamped; the background stays as it is."""
+    backend, gain = make_backend(), np.array([0.5, 1.0, 1.7])
+    black = RasterOptions(background=(0.0, 0.0, 0.0))
+    plain, shown = (
+        backend.forward(*with_appearance(gaussians, EMBEDDING, g).parameters(), CAMERA, black).color
+        for g in (None, gain)
+    )
+    assert torch.allclose(shown, plain * torch.from_numpy(gain).float(), atol=1e-5)
+
+
 def test_gradients_equal_the_reference_and_finite_differences(gaussians: Gaussians) -> None:
     assert gaussians.appearance is not None
     backend = make_backend()
@@ -92,7 +103,7 @@ def test_what_is_shown_is_undone_to_the_bit(gaussians: Gaussians) -> None:
 
 def test_the_scene_has_the_colours_of_the_mean_photograph(gaussians: Gaussians) -> None:
     embeddings = AppearanceEmbeddings(np.array([[1.0, 0.5], [2.0, -3.0], [0.5, 0.1]]))
-    centred, appearance = embeddings.centred(gaussians, ["a", "b", "c"])
+    centred, appearance = embeddings.centred(gaussians, ["a", "b", "c"], None)
     assert centred.appearance is None
     mean = np.mean(list(appearance.embeddings.values()), 0)
     assert np.abs(mean).max() < 1e-12

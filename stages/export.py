@@ -36,6 +36,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
+    from pipeline.holes.record import num_invented
     from pipeline.render.registry import use_device
     from pipeline.scene.blocks import Partition
     from pipeline.scene.unrounded import Unrounded
@@ -49,7 +50,8 @@ def work(job: Job) -> None:
         job.section(Split),
     )
     scene = ExportScene(
-        trained=inputs.trained_arrays(job),
+        gaussians=inputs.filled_arrays(job),
+        num_invented=num_invented(job.inputs.get("holes")),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
@@ -86,12 +88,13 @@ SPEC = StageSpec(
     decide=decide,
     counters=ExportCounters,
     inputs=inputs.TRAINED
+    | inputs.HOLES
     | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)},
     only_if={
         "dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats),
         "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
     },
-    optional=("partition",),
+    optional=("partition", "holes"),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     facts=facts,
     packages=(

@@ -8,6 +8,7 @@ Snakefile imports it.
 
 from __future__ import annotations
 
+import shlex
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -359,6 +360,10 @@ def _plain_command(fill: str) -> str:
             "Input should be none, inpaint or a command: one line of UTF-8 of at most "
             f"{MAX_COMMAND} characters"
         )
+    try:
+        shlex.split(fill)
+    except ValueError as error:
+        raise ValueError(f"Input should be none, inpaint or a command ({error})") from None
     return fill
 
 

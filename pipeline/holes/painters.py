@@ -47,12 +47,9 @@ _CONTRACT = (
 
 
 def painter_of(fill: str) -> Painter:
-    """The painter that the option ``holes.fill`` names, which is not ``none``.
-
-    Raises:
-        UserError: the command cannot be split into words.
-    """
-    return inpaint if fill == "inpaint" else PaintCommand.parse(fill)
+    """The painter that the option ``holes.fill`` names, which is not ``none``. A command is split
+    as a shell does; none is started."""
+    return inpaint if fill == "inpaint" else PaintCommand(tuple(shlex.split(fill)))
 
 
 def inpaint(image: Picture, hole: Bools, weights: Doubles) -> Picture:
@@ -110,26 +107,6 @@ class PaintCommand:
 
     words: tuple[str, ...]
     time_limit_s: float = TIME_LIMIT_S
-
-    @staticmethod
-    def parse(command: str) -> PaintCommand:
-        """Split a command as a shell does; none is started.
-
-        Raises:
-            UserError: a quotation is not closed, or there is no word.
-        """
-        try:
-            words = tuple(shlex.split(command))
-        except ValueError as error:
-            words, reason = (), str(error)
-        else:
-            reason = "no word"
-        if not words:
-            raise UserError(
-                f"holes.fill: expected none, inpaint or a command, found {command!r} ({reason})",
-                fix="close its quotation marks, or set holes.fill: none",
-            )
-        return PaintCommand(words)
 
     def __str__(self) -> str:
         return shlex.join(self.words)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from pipeline.config.load import scene_config
 from pipeline.holes.painters import PaintCommand, inpaint, painter_of, pull_push
 from pipeline.runtime.errors import UserError
 
@@ -40,14 +41,20 @@ def test_a_command_gets_the_image_and_a_white_mask_and_returns_its_output():
 
 
 def test_a_command_is_split_as_a_shell_does_and_run_without_one():
-    found = PaintCommand.parse("paint --model 'a b' $HOME; rm")
-    assert found.words == ("paint", "--model", "a b", "$HOME;", "rm")
+    found = painter_of("paint --model 'a b' $HOME; rm")
+    assert isinstance(found, PaintCommand) and found.words == (
+        "paint",
+        "--model",
+        "a b",
+        "$HOME;",
+        "rm",
+    )
 
 
-@pytest.mark.parametrize("text", ["paint 'a", '"', "  "])
-def test_a_command_that_is_no_list_of_words_is_an_error(text):
-    with pytest.raises(UserError, match=r"holes\.fill: expected none, inpaint or a command"):
-        painter_of(text)
+@pytest.mark.parametrize("text", ["paint 'a", '"', "  ", "a\nb", "x" * 5000])
+def test_a_command_that_is_no_list_of_words_is_an_error_of_the_options(text):
+    with pytest.raises(UserError, match=r"(?s)holes\.fill.* none, inpaint or a command"):
+        scene_config({"holes": {"fill": text}}, "x")
 
 
 SAVE = f"{READ} Image.new"

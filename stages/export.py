@@ -44,6 +44,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
+    from pipeline.holes.record import num_invented
     from pipeline.io.appearance_files import Embeddings
     from pipeline.render.registry import use_device
     from pipeline.scene.blocks import Partition
@@ -58,7 +59,8 @@ def work(job: Job) -> None:
         job.section(Split),
     )
     scene = ExportScene(
-        trained=inputs.trained_arrays(job),
+        gaussians=inputs.filled_arrays(job),
+        num_invented=num_invented(job.inputs.get("holes")),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
@@ -116,6 +118,7 @@ SPEC = StageSpec(
     decide=decide,
     counters=ExportCounters,
     inputs=inputs.TRAINED
+    | inputs.HOLES
     | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)}
     | {"photos": inputs.PHOTOS},
     only_if={
@@ -123,7 +126,7 @@ SPEC = StageSpec(
         "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
         "photos": lambda config: MASKS_FORMAT in config.export.formats,
     },
-    optional=("partition",),
+    optional=("partition", "holes"),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     facts=facts,
     packages=(

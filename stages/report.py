@@ -46,7 +46,7 @@ def work(job: Job) -> None:
     runs = read_runs(metrics, results, without=job.stage) | {job.stage: own}
     protocol = choose_protocol(views, job.section(Split), train)
     trained = TrainedScene(
-        gaussians=inputs.trained_arrays(job),
+        gaussians=inputs.filled_arrays(job),
         views=views,
         orientations={p.name: p.orientation for p in inputs.read_manifest(job, "views").photos},
         background=protocol.background,
@@ -71,7 +71,9 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     inputs=inputs.TRAINED
+    | inputs.HOLES
     | {name: (name,) for name in ("inspect", "evaluate", "coverage", "export")},
+    optional=tuple(inputs.HOLES),
     options=("experiments.report", "views", "split", "train.antialias", "train.background"),
     seeded=True,
     publishes={

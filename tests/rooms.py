@@ -38,6 +38,7 @@ ROOMS = {
     "training.blocks": "division of large scenes into blocks",
     "metrics": "PSNR, SSIM, FLIP, LPIPS, protocols, pose errors",
     "coverage": "what the photographs did not see",
+    "holes": "invented content for places that no photograph shows",
     "surface": "meshes",
     "export": "files for other programs",
     "reporting": "metrics.json, the page of a scene, tables of batches",

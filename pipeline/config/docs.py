@@ -44,6 +44,7 @@ _RECORDS = {
     "frame.json": "pipeline.io.frame_json:Frame",
     "path.json": "pipeline.surface.path:PathFile",
     "partition.json": "pipeline.scene.blocks:Partition",
+    "holes.json": "pipeline.holes.record:HolesRecord",
 }
 
 # The model of each stage's counters. A test compares them with the declarations.
@@ -65,6 +66,7 @@ COUNTERS = {
     "block": "pipeline.training.loop.counters:TrainCounters",
     "polish": "pipeline.training.loop.counters:TrainCounters",
     "train": "pipeline.training.loop.counters:TrainCounters",
+    "holes": "pipeline.holes.counters:HolesCounters",
     "evaluate": "pipeline.metrics.counters:EvaluateCounters",
     "coverage": "pipeline.runtime.counters:NoCounters",
     "export": "pipeline.export.counters:ExportCounters",

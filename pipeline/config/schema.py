@@ -8,6 +8,7 @@ Snakefile imports it.
 
 from __future__ import annotations
 
+import shlex
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -29,10 +30,13 @@ from pipeline.config.section import (
     Unit,
 )
 from pipeline.config.video import VideoExport
+from pipeline.runtime.text import is_plain
 
 #: The largest number of blocks. Each is a job that depends on all others, and Snakemake's time to
 #: plan them grows with the square of their number.
 MAX_BLOCKS = 200
+#: The largest number of characters of a command.
+MAX_COMMAND = 4000
 
 Device = Literal["auto", "cpu", "gpu"] | Annotated[str, Field(pattern=r"^gpu:[0-9]{1,3}$")]
 SHDegree = Annotated[int, Field(ge=0, le=3), Unit("degree")]
@@ -357,6 +361,31 @@ class Partition(Section):
     )
 
 
+def _plain_command(fill: str) -> str:
+    if not fill.strip() or not is_plain(fill) or len(fill) > MAX_COMMAND:
+        raise ValueError(
+            "Input should be none, inpaint or a command: one line of UTF-8 of at most "
+            f"{MAX_COMMAND} characters"
+        )
+    try:
+        shlex.split(fill)
+    except ValueError as error:
+        raise ValueError(f"Input should be none, inpaint or a command ({error})") from None
+    return fill
+
+
+class Holes(Section):
+    """The places that no photograph shows."""
+
+    fill: Annotated[str, AfterValidator(_plain_command)] = Field(
+        "none",
+        description="none: they stay as training leaves them. inpaint: Gaussians are invented "
+        "there, in the colours around each hole. Anything else is a command that paints the holes "
+        "of rendered views, called as COMMAND IMAGE.png MASK.png OUTPUT.png, without a shell. No "
+        "measure of quality counts what is invented; metrics.json and the page tell its share.",
+    )
+
+
 class Evaluate(Section):
     """Test views compared with renders."""
 
@@ -453,6 +482,7 @@ class Config(Section):
     init: Init = Field(default_factory=Init)
     train: Train = Field(default_factory=Train)
     partition: Partition = Field(default_factory=Partition)
+    holes: Holes = Field(default_factory=Holes)
     evaluate: Evaluate = Field(default_factory=Evaluate)
     export: Export = Field(default_factory=Export)
     experiments: Experiments = Field(default_factory=Experiments)

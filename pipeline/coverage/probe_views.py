@@ -31,7 +31,7 @@ class ProbeView:
     """A camera at reduced size with a render of the trained scene.
 
     Attributes:
-        view: The camera, reduced to ``SIDE``.
+        view: The camera, reduced to ``SIDE`` unless ``render_probe`` got another side.
         focal: The focal length in pixels at the full size: the geometric mean of fx and fy.
         rgb: (H, W, 3) uint8 render.
         depth: (H, W) median depth (camera z, world units); inf if the ray meets no surface.
@@ -100,9 +100,9 @@ def reduced(view: View, side: int = SIDE) -> View:
     return resized(view, *view_size(view.width, view.height, side))
 
 
-def render_probe(view: View, render: Renderer) -> ProbeView:
-    """Render a view at reduced size."""
-    small = reduced(view)
+def render_probe(view: View, render: Renderer, side: int = SIDE) -> ProbeView:
+    """Render a view, reduced to ``side``."""
+    small = reduced(view, side)
     rendered = render(small)
     on_surface = (rendered.alpha >= MIN_ALPHA) & (rendered.median_depth > 0)
     depth = np.where(on_surface, rendered.median_depth, np.float32(np.inf))

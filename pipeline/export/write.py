@@ -59,7 +59,7 @@ class ExportScene:
     """A finished scene.
 
     Attributes:
-        trained: The Gaussians after training.
+        gaussians: The Gaussians after training, followed by the invented ones.
         model: The cameras and sparse points.
         manifest: The photographs of the views.
         views: All views, at the size of the photographs.
@@ -70,9 +70,10 @@ class ExportScene:
         dense: The folder of the dense stage; None if it did not run.
         partition: The blocks of the scene; None if the scene is one block.
         found: The masks that training found; None if they are not exported.
+        num_invented: The number of invented Gaussians.
     """
 
-    trained: GaussianArrays
+    gaussians: GaussianArrays
     model: Reconstruction
     manifest: Manifest
     views: list[View]
@@ -83,6 +84,7 @@ class ExportScene:
     dense: Path | None = None
     partition: Partition | None = None
     found: FoundMasks | None = None
+    num_invented: int = 0
 
     @property
     def normalization(self) -> Normalization:
@@ -202,10 +204,14 @@ def export_scene(
     model = scene.given.model_to_given(scene.model, scene.normalization)
     poses = {name: image.world_to_camera for name, image in model.by_name().items()}
     views = [replace(view, world_to_camera=poses[view.name]) for view in scene.views]
-    means = scene.trained.means
+    means = scene.gaussians.means
     normalization, scene = scene.normalization, _in_given_unit(scene)
     gaussians = reduce_gaussians(
-        scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
+        scene.gaussians,
+        config.sh_degree,
+        config.min_opacity,
+        experiments.morton_order,
+        scene.num_invented,
     )
     # The faces of blocks are in the unit of training.
     blocks = _blocks_of(means[gaussians.rows], scene.partition)
@@ -239,7 +245,7 @@ def _in_given_unit(scene: ExportScene) -> ExportScene:
         return scene
     return replace(
         scene,
-        trained=scene.trained.scaled(1 / unit.scale),
+        gaussians=scene.gaussians.scaled(1 / unit.scale),
         model=unit.model_to_given(scene.model),
         views=[unit.view_to_given(view) for view in scene.views],
         training_size_views=[unit.view_to_given(view) for view in scene.training_size_views],
@@ -262,8 +268,16 @@ def _write_frame(out: Path, files: _Files, written: list[str], train: Train, spl
     )
     up = scene_up(scene.views, scene.manifest)
     given = [WRITERS[name][0] for name in _GIVEN_WORLD] if files.moved else []
+    first_invented = len(scene.gaussians) - scene.num_invented
     describe_frame(
-        files.gaussians, scene.views, up, render, written, scene.georeference, given
+        files.gaussians,
+        scene.views,
+        up,
+        render,
+        written,
+        scene.georeference,
+        given,
+        num_invented=int((files.gaussians.rows >= first_invented).sum()),
     ).write(out)
 
 
@@ -283,10 +297,11 @@ def _write_rendered_formats(
     messages = write_rendered(
         out,
         config,
-        Gaussians.sharing(scene.trained),
+        Gaussians.sharing(scene.gaussians),
         scene.training_size_views,
         choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),
+        num_invented=scene.num_invented,
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

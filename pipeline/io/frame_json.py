@@ -49,6 +49,11 @@ class FrameGaussians(JsonObject):
 
     count: int = Field(ge=0, description="Number of Gaussians.")
     sh_degree: int = Field(ge=0, le=3, description="Degree of the spherical harmonics.")
+    num_invented: int = Field(
+        0,
+        ge=0,
+        description="Number of invented Gaussians (holes.fill), the last ones of each file.",
+    )
 
 
 class FrameGeoreference(JsonObject):
@@ -90,6 +95,7 @@ def describe_frame(
     files: Sequence[str],
     georeference: Georeference | None = None,
     given_world: Sequence[str] = (),
+    num_invented: int = 0,
 ) -> Frame:
     """The content of ``frame.json``.
 
@@ -99,6 +105,7 @@ def describe_frame(
         files: The names of the exported files.
         georeference: None for given poses in their own world.
         given_world: The files whose coordinates are those of the given poses' world.
+        num_invented: The number of invented Gaussians, the last ones of ``gaussians``.
     """
     centres = np.stack([view.centre for view in views])
     x, y, z = (_rounded(value) for value in centres.mean(0))
@@ -115,7 +122,9 @@ def describe_frame(
         cameras=FrameCameras(
             count=len(views), centre=(x, y, z), extent=_rounded(scene_extent(list(views)))
         ),
-        gaussians=FrameGaussians(count=len(gaussians), sh_degree=gaussians.sh_degree),
+        gaussians=FrameGaussians(
+            count=len(gaussians), sh_degree=gaussians.sh_degree, num_invented=num_invented
+        ),
         colour="sRGB: 0.5 + spherical harmonics, blended without conversion to linear",
         render=render,
     )

@@ -14,6 +14,8 @@ from pipeline.plan.values import Plan
 # Time limits are this many times the estimate, and at least this many minutes: nodes differ, and a
 # job that is killed for its time starts again from its checkpoint.
 MARGIN, MIN_MINUTES = 4, 10
+# The time in seconds that a user's command may take to paint the holes of all views.
+MAX_PAINTING_S = 3600.0
 # The number of pairs per photograph where not all pairs are matched.
 NEIGHBOURS = 40
 
@@ -88,6 +90,11 @@ def _dense(plan: Plan) -> float:
     return _PROGRAM + 1.2e-5 * width * height * _photos(plan)
 
 
+def _holes(plan: Plan) -> float:
+    painted = 0.0 if plan.config.holes.fill == "inpaint" else MAX_PAINTING_S
+    return _per_photo(2.0)(plan) + 60 + painted
+
+
 def _coarse(plan: Plan) -> float:
     return _PROGRAM + 0.2 * _photos(plan) + _steps(plan)
 
@@ -115,6 +122,7 @@ _ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
     "block": _block,
     "polish": _block,
     "train": _train,
+    "holes": _holes,
     "evaluate": _per_photo(0.5),
     "coverage": _per_photo(1.0),
     "export": _per_photo(0.5),

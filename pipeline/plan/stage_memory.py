@@ -238,6 +238,11 @@ def _coverage(plan: Plan, threads: int) -> float:
     return _RASTERIZER + 25 + _MODEL_VIEWS * _photos(plan) + _RENDERED * _gaussians(plan)
 
 
+def _holes(plan: Plan, threads: int) -> float:
+    # Each painted view is rendered and differentiated with as many invented Gaussians again.
+    return _coverage(plan, threads) + 2 * _PARTITIONED * _gaussians(plan)
+
+
 def _export(plan: Plan, threads: int) -> float:
     written = _NUMPY + _MODEL_WRITTEN * _photos(plan) + _HELD * _gaussians(plan)
     rendered = RENDERED_FORMATS.intersection(plan.config.export.formats)
@@ -268,6 +273,7 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "block": _block,
     "polish": _block,
     "train": _train,
+    "holes": _holes,
     "evaluate": _evaluate,
     "coverage": _coverage,
     "export": _export,

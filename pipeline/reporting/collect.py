@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipeline.holes.record import HolesRecord
 from pipeline.metrics.evaluation import Evaluation, SceneQuality
 from pipeline.photos.counters import DecodeCounters, InspectCounters
 from pipeline.plan.record import PlanRecord
@@ -56,6 +57,7 @@ def collect_metrics(
             "input": found(plan.facts, frames if decoded and plan.facts.videos else None),
             **{name: getattr(evaluation, name) for name in SceneQuality.model_fields},
             "num_gaussians": train.num_gaussians,
+            "invented": HolesRecord.read(folder / "holes").summary() if "holes" in ran else None,
             "device": train.device,
             "registered_images": sfm.registered if sfm else inspect.given_poses,
             "total_images": inspect.photos + inspect.left_out + frames,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.coverage.record import CoverageRecord
+from pipeline.holes.record import HolesRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import TimedMetrics
@@ -107,6 +108,19 @@ class CoverageSection:
     pictures: Mapping[str, NDArray[np.uint8]]
 
 
+@dataclass(frozen=True)
+class HolesSection:
+    """What was invented where no photograph sees the scene.
+
+    Attributes:
+        record: The measures.
+        pictures: The render before, the mask and the render after of some painted views, uint8.
+    """
+
+    record: HolesRecord
+    pictures: Sequence[Sequence[NDArray[np.uint8]]]
+
+
 class TrainingRecord(NamedTuple):
     """A record of the training curve, and the seconds of training at its end."""
 
@@ -128,6 +142,7 @@ class SceneResults:
         curve: The training curve.
         comparisons: The views to show, worst first.
         blocks: The trained blocks; None for a scene that was trained as one block.
+        holes: What was invented; None without.
         photographs: The photograph's name for each view that has another name.
         downloads: The exported files.
     """
@@ -141,6 +156,7 @@ class SceneResults:
     curve: Sequence[TrainingRecord]
     comparisons: Sequence[Comparison]
     blocks: BlocksSection | None = None
+    holes: HolesSection | None = None
     photographs: Mapping[str, str] = field(default_factory=dict)
     downloads: Sequence[Download] = ()
 

@@ -11,6 +11,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from pipeline.holes.record import InventedSummary
 from pipeline.metrics.evaluation import SceneQuality
 from pipeline.plan.values import job_folders
 from pipeline.runtime.json_file import JsonFile, JsonObject
@@ -38,6 +39,9 @@ class Metrics(JsonFile, SceneQuality):
     input: str = Field(description="What the scene folder holds, in one line.")
     seed: int | None = Field(description="Of the run.")
     num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
+    invented: InventedSummary | None = Field(
+        None, description="What `holes.fill` invented; null without. No other measure counts it."
+    )
     device: Literal["cpu", "gpu"] = Field("cpu", description="What trained the scene.")
     registered_images: int | None = Field(description="Photographs that have a pose.")
     total_images: int = Field(

@@ -23,7 +23,7 @@ from pipeline.reporting.data import SceneResults, TrainingRecord
 from pipeline.reporting.html import Section, render
 from pipeline.reporting.metrics import TimedMetrics
 from pipeline.reporting.names import with_photograph_names
-from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
+from pipeline.reporting.pictures import ERROR_SCALE, embedded, page_pictures, scale_gradient
 from pipeline.reporting.publish import MARK
 from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
 from pipeline.reporting.verdict import grouped_warnings, verdict
@@ -80,6 +80,9 @@ def report_html(results: SceneResults) -> str:
     ]
     if results.blocks is not None:
         contents.insert(5, ("blocks", "Blocks", blocks_map(results, results.blocks.partition)))
+    if results.holes is not None:
+        invented = [[embedded(picture) for picture in row] for row in results.holes.pictures]
+        contents.insert(1, ("holes", "What is invented", invented))
     sections = [
         Section(key, title, f"scene/{key}.html.jinja", content)
         for key, title, content in contents

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
+from pipeline.holes.record import HolesRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
@@ -17,6 +18,7 @@ from pipeline.reporting.data import (
     BlocksSection,
     Comparison,
     CoverageSection,
+    HolesSection,
     Rank,
     SceneResults,
     TrainedScene,
@@ -47,7 +49,8 @@ def read_results(
     """Read the results of a scene.
 
     Args:
-        folders: The folders of inspect, train, evaluate, coverage and export, by stage.
+        folders: The folders of inspect, train, evaluate, coverage and export, and of holes if it
+            ran, by stage.
         metrics: The content of ``metrics.json`` with the times of the stages.
         plan: The plan of the scene.
         trained: The Gaussians and their views.
@@ -71,6 +74,7 @@ def read_results(
             for label, measured in ranked(metrics.per_view, shown)
         ],
         blocks=_blocks(plan, scene),
+        holes=_holes(folders.get("holes")),
         photographs=photograph_names(
             [view.name for view in trained.views],
             [photo.name for photo in Manifest.read(folders["inspect"] / "images.json").photos],
@@ -109,6 +113,22 @@ def _coverage(folder: Path) -> CoverageSection:
         with Image.open(folder / name) as picture:
             pictures[name] = np.asarray(picture)
     return CoverageSection(record, pictures)
+
+
+def _holes(folder: Path | None) -> HolesSection | None:
+    """What was invented, with the pictures of the views that are shown."""
+    if folder is None:
+        return None
+    record, shown = HolesRecord.read(folder), []
+    for view in record.painted:
+        files = [file for file in (view.before, view.mask, view.after) if file is not None]
+        pictures = []
+        for file in files:
+            with Image.open(folder / file) as picture:
+                pictures.append(np.asarray(picture))
+        if pictures:
+            shown.append(pictures)
+    return HolesSection(record, shown)
 
 
 def _blocks(plan: PlanRecord, results: Path) -> BlocksSection | None:

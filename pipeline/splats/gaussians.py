@@ -97,6 +97,10 @@ class Gaussians:
         """Copies of the Gaussians selected by a boolean mask (N,) or int64 indices (M,)."""
         return Gaussians(**{k: v[which].contiguous() for k, v in self.tensors().items()})
 
+    def first(self, count: int) -> Gaussians:
+        """The first Gaussians, in tensors that share their memory with these."""
+        return Gaussians(**{k: v[:count] for k, v in self.tensors().items()})
+
     def clone(self) -> Gaussians:
         """The same Gaussians with copies of all tensors."""
         return Gaussians(**{k: v.clone() for k, v in self.tensors().items()})

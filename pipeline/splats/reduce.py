@@ -10,10 +10,17 @@ from pipeline.splats.z_order import z_order
 
 
 def reduce_gaussians(
-    gaussians: GaussianArrays, sh_degree: int, min_opacity: float, morton_order: bool
+    gaussians: GaussianArrays,
+    sh_degree: int,
+    min_opacity: float,
+    morton_order: bool,
+    num_invented: int = 0,
 ) -> GaussianRows:
     """Remove SH bands above ``sh_degree`` and Gaussians with an opacity below ``min_opacity``, and
     optionally sort along a Z-order curve.
+
+    Args:
+        num_invented: The number of invented Gaussians, the last ones; they stay the last ones.
 
     Raises:
         UserError: No Gaussian is left.
@@ -28,5 +35,7 @@ def reduce_gaussians(
                 fix="lower min_opacity",
             )
     if morton_order:
-        rows = rows[z_order(gaussians.means[rows])]
+        trained = rows < len(gaussians) - num_invented
+        parts = rows[trained], rows[~trained]
+        rows = np.concatenate([part[z_order(gaussians.means[part])] for part in parts])
     return GaussianRows(gaussians, rows, min(sh_degree, gaussians.sh_degree))

@@ -42,6 +42,7 @@ def write_rendered(
     options: RasterOptions,
     *,
     up: NDArray[np.float64],
+    num_invented: int = 0,
 ) -> Messages:
     """Write the outputs that ``config.formats`` names: ``renders/``, ``depths/``, ``mesh.ply`` and
     ``mesh.glb``, the video and its camera path ``path.json``.
@@ -50,12 +51,14 @@ def write_rendered(
         views: All views, at the size to render.
         options: The options of the rasterizer (``Protocol.options``).
         up: (3,) up vector of the world.
+        num_invented: The number of invented Gaussians, the last ones. Only the video shows them.
     """
     formats = config.formats
     messages = Messages([], [])
     if not {"renders", "depths", "mesh"}.isdisjoint(formats):
         with TemporaryDirectory(prefix="renders-") as folder:
-            renders = RenderCache(gaussians, views, options, Path(folder))
+            trained = gaussians.first(len(gaussians) - num_invented)
+            renders = RenderCache(trained, views, options, Path(folder))
             if "renders" in formats:
                 write_renders(out / "renders", renders)
             if "depths" in formats:

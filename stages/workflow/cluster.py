@@ -21,7 +21,7 @@ GROUPS: Mapping[str, Sequence[str]] = {
         *("refine", "undistort", "dense", "init"),
     ),
     "coarse": ("coarse", "partition"),
-    "train": ("train", "export"),
+    "train": ("train", "holes", "export"),
     "finish": ("evaluate", "coverage", "report"),
 }
 # Cores that a stage asks for on a cluster whose nodes are unknown: few nodes have fewer.

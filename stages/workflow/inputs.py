@@ -34,6 +34,10 @@ TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
 # The folder with the masks of what training left out of views.
 TRANSIENTS = "transients"
+
+# The input of stages after training that read the Gaussians with invented ones, if there are any.
+HOLES = {"holes": ("holes",)}
+
 # Roles of stages whose folder has the scene's background, the latest in the DAG first.
 BACKGROUND = ("train", "coarse", "init")
 # Options that rendering outside of training depends on.
@@ -145,11 +149,12 @@ def training_views(job: Job) -> list[View]:
     return found
 
 
-def trained_arrays(job: Job) -> GaussianArrays:
-    """The trained Gaussians, for stages that do not render."""
+def filled_arrays(job: Job) -> GaussianArrays:
+    """The trained Gaussians and the invented ones after them, for stages that do not render."""
     from pipeline.io.npz import read_gaussian_arrays
 
-    return read_gaussian_arrays(job.inputs["train"] / "gaussians.npz")
+    folder = job.inputs.get("holes", job.inputs["train"])
+    return read_gaussian_arrays(folder / "gaussians.npz")
 
 
 def trained_gaussians(job: Job) -> Gaussians:

@@ -150,6 +150,7 @@ FLIPS = {
     f"{_M}.growth_share": Flip(0.2, MCMC),
     f"{_M}.noise": Flip(False, MCMC),
     "partition.blocks": Flip(3, BLOCKS),
+    "holes.fill": Flip("inpaint", POSED),
     "evaluate.lpips_net": Flip("none", POSED),
     "export.formats": Flip(["ply"], POSED),
     "export.sh_degree": Flip(1, POSED),

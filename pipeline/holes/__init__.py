@@ -1,0 +1,1 @@
+"""Invented content for the places that no photograph shows."""

@@ -131,6 +131,11 @@ class TrainExperiments(Section):
         description="Weight of the error of the rendered alpha for images with alpha, relative to "
         "L1 (3DGS: 0).",
     )
+    mask_loss_weight: LossWeight = Field(
+        0.1,
+        description="Weight of the rendered alpha of pixels that a mask excludes, relative to the "
+        "colour loss. 0, or background: skybox or fill: no loss on these pixels.",
+    )
     clamp_color_gradient: bool = Field(
         False,
         description="No gradient for a colour that is clamped at 0 (3DGS). False: gradients that "
@@ -224,6 +229,7 @@ class ExportExperiments(Section):
         description="Sort Gaussians along a Z-order curve (smaller files). False: in the order of "
         "training.",
     )
+    min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")
 
 
 class ReportExperiments(Section):

@@ -40,7 +40,6 @@ PRESETS: dict[str, dict[str, Any]] = {
             "appearance": "none",
             "ssim_loss_weight": 0.2,
             "depth_loss_weight": 0.0,
-            "mask_loss_weight": 0.0,
             "density": {"strategy": "original"},
         },
         "experiments": {
@@ -50,6 +49,7 @@ PRESETS: dict[str, dict[str, Any]] = {
                 "sh_degree_interval": 1000,
                 "squared_error_loss_weight": 0.0,
                 "alpha_loss_weight": 0.0,
+                "mask_loss_weight": 0.0,
                 "clamp_color_gradient": True,
                 "dropout": 0.0,
                 "views_per_sh_coefficient": 0.0,

@@ -8,13 +8,13 @@ Snakefile imports it.
 
 from __future__ import annotations
 
-import shlex
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
 from pipeline.config.density import Density, Gradient
 from pipeline.config.experiments import Experiments
+from pipeline.config.holes import Holes
 from pipeline.config.section import (
     MAX_PHOTOS,
     Count,
@@ -30,13 +30,10 @@ from pipeline.config.section import (
     Unit,
 )
 from pipeline.config.video import VideoExport
-from pipeline.runtime.text import is_plain
 
 #: The largest number of blocks. Each is a job that depends on all others, and Snakemake's time to
 #: plan them grows with the square of their number.
 MAX_BLOCKS = 200
-#: The largest number of characters of a command.
-MAX_COMMAND = 4000
 
 Device = Literal["auto", "cpu", "gpu"] | Annotated[str, Field(pattern=r"^gpu:[0-9]{1,3}$")]
 SHDegree = Annotated[int, Field(ge=0, le=3), Unit("degree")]
@@ -334,11 +331,6 @@ class Train(Section):
         "depth maps of depths/, or in those of multi-view stereo with init.method: dense. 0: no "
         "depth loss; auto: 0.3 with depth maps, else 0.03 for up to 30 photographs, else 0.",
     )
-    mask_loss_weight: LossWeight = Field(
-        0.1,
-        description="Weight of the rendered alpha of pixels that a mask excludes, relative to the "
-        "colour loss. 0, or background: skybox or fill: no loss on these pixels.",
-    )
     density: Density = Field(default_factory=Gradient)
 
 
@@ -358,31 +350,6 @@ class Partition(Section):
         "threads, which changes no result. null: no limit, but images are read from disk if "
         "training would take over three quarters of the memory of the machine or container.",
         json_schema_extra={"decides_result": False},
-    )
-
-
-def _plain_command(fill: str) -> str:
-    if not fill.strip() or not is_plain(fill) or len(fill) > MAX_COMMAND:
-        raise ValueError(
-            "Input should be none, inpaint or a command: one line of UTF-8 of at most "
-            f"{MAX_COMMAND} characters"
-        )
-    try:
-        shlex.split(fill)
-    except ValueError as error:
-        raise ValueError(f"Input should be none, inpaint or a command ({error})") from None
-    return fill
-
-
-class Holes(Section):
-    """The places that no photograph shows."""
-
-    fill: Annotated[str, AfterValidator(_plain_command)] = Field(
-        "none",
-        description="none: they stay as training leaves them. inpaint: Gaussians are invented "
-        "there, in the colours around each hole. Anything else is a command that paints the holes "
-        "of rendered views, called as COMMAND IMAGE.png MASK.png OUTPUT.png, without a shell. No "
-        "measure of quality counts what is invented; metrics.json and the page tell its share.",
     )
 
 
@@ -447,7 +414,6 @@ class Export(Section):
         "path).",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
-    min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")
     mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(
         None,
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "

@@ -12,7 +12,8 @@ class ExportCounters(StageCounters):
     """Counters of the export stage."""
 
     exported_gaussians: int = Field(
-        ge=0, description="Number of Gaussians in each exported file, after `export.min_opacity`."
+        ge=0,
+        description="Number of Gaussians in each exported file, after `experiments.export.min_opacity`.",
     )
 
     def headline(self) -> str:

@@ -209,7 +209,7 @@ def export_scene(
     gaussians = reduce_gaussians(
         scene.gaussians,
         config.sh_degree,
-        config.min_opacity,
+        experiments.min_opacity,
         experiments.morton_order,
         scene.num_invented,
     )

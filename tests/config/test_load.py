@@ -31,7 +31,7 @@ from pipeline.runtime.errors import UserError
         ({"export": {"video": {"long_side_px": 0}}}, "export.video.long_side_px"),
         ({"export": {"video": {"long_side_px": 100_000}}}, "export.video.long_side_px"),
         ({"export": {"video": {"path": "spiral"}}}, "export.video.path"),
-        ({"train": {"mask_loss_weight": float("nan")}}, "train.mask_loss_weight"),
+        ({"train": {"ssim_loss_weight": float("nan")}}, "train.ssim_loss_weight"),
         (
             {"train": {"density": {"max_gausians": 5}}},
             "max_gausians: no such option (did you mean train.density.max_gaussians?)",
@@ -81,12 +81,12 @@ def test_a_configuration_wins_over_the_scene_and_brings_its_preset():
     raw = {
         "preset": "balanced",
         "train": {"ssim_loss_weight": 0.3},
-        "scenes": {"fox": {"train": {"sh_degree": 2, "mask_loss_weight": 0.5}}},
+        "scenes": {"fox": {"train": {"sh_degree": 2, "depth_loss_weight": 0.5}}},
         "configs": {"plain": {"preset": "fast", "train": {"sh_degree": 0}}},
     }
     plain = scene_config(raw, "fox", "plain", seed=7)
     assert (plain.preset, plain.seed, plain.train.sh_degree) == ("fast", 7, 0)
-    assert (plain.train.ssim_loss_weight, plain.train.mask_loss_weight) == (0.3, 0.5)
+    assert (plain.train.ssim_loss_weight, plain.train.depth_loss_weight) == (0.3, 0.5)
     assert plain.train.steps == PRESETS["fast"]["train"]["steps"]
     assert scene_config(raw, "fox").train.sh_degree == 2
 
@@ -173,7 +173,7 @@ def test_the_option_page_speaks_of_values_not_of_types():
 
 def test_the_product_has_few_options():
     """Each with a description and, if it is a number, a range and a unit."""
-    assert docs.num_options() <= 66
+    assert docs.num_options() <= 65
     for page in (docs.page(), docs.experiments_page()):
         rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
         options = [row for row in rows if len(row) == 5]

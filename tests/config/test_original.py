@@ -59,7 +59,7 @@ def test_nothing_is_added_to_the_published_method():
     assert train.appearance == "none"
     losses = (
         train.depth_loss_weight,
-        train.mask_loss_weight,
+        experiments.mask_loss_weight,
         experiments.alpha_loss_weight,
         experiments.squared_error_loss_weight,
     )

@@ -115,7 +115,7 @@ def test_every_json_file_of_a_stage_is_what_its_model_writes(finished, tmp_path)
 
 
 def test_an_export_option_never_retrains_and_a_second_run_does_nothing(project):
-    config = TINY | {"export": {"min_opacity": 0.1}}
+    config = TINY | {"experiments": {"export": {"min_opacity": 0.1}}}
     done = snakemake(project, TARGET, config=config)
     assert rules_run(done) == {"export", "report"}
     assert not started(snakemake(project, TARGET, config=config))

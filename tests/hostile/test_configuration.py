@@ -32,9 +32,9 @@ REFUSED: dict[str, tuple[dict[Any, Any], str]] = {
     ),
     "steps-digits": ({"train": {"steps": 10**5000}}, "found a number of thousands of digits"),
     "steps-true": ({"train": {"steps": True}}, "train.steps: .* not true or false, found True"),
-    "weight-true": ({"train": {"mask_loss_weight": True}}, "not true or false"),
+    "weight-true": ({"experiments": {"train": {"mask_loss_weight": True}}}, "not true or false"),
     "weight-1e300": (
-        {"train": {"mask_loss_weight": 1e300}},
+        {"experiments": {"train": {"mask_loss_weight": 1e300}}},
         "Input should be less than or equal to 1000000",
     ),
     "seed-true": ({"seed": True}, "seed: .* not true or false"),

@@ -93,7 +93,7 @@ def plane_losses(scene: TrainingScene, run: TrainingRun) -> Sequence[PlaneLoss]:
     losses: list[PlaneLoss] = [
         AlphaLoss(
             # Before a skybox, masks hide what is in the way, and leave no empty space.
-            options.mask_loss_weight if scene.sky is None else 0.0,
+            options.experiments.mask_loss_weight if scene.sky is None else 0.0,
             options.experiments.alpha_loss_weight,
             options.experiments.squared_error_loss_weight,
         )

@@ -5,10 +5,13 @@ import pytest
 from pipeline.config.schema import Config
 from pipeline.plan import stage_memory
 from pipeline.plan.plan import input_folders
+from pipeline.plan.settle import settle
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
 from stages.workflow.registry import STAGES
+from tests.pictures import photos, picture
 from tests.plan.scans import many, plan_of, posed
+from tests.plan.test_scan import config, look
 from tests.plans import BLOCK_STAGES, CHUNK_STAGES, make_plan
 
 
@@ -158,6 +161,25 @@ def test_blocks_have_no_appearance_embeddings(tmp_path):
     with pytest.raises(UserError, match=r"embedding is not available in blocks, .* 2\n") as caught:
         make_plan(scan, Config.model_validate(options | {"partition": {"blocks": 2}}))
     assert "train.appearance: exposure" in str(caught.value)
+
+
+def test_passers_by_are_searched_for_unless_the_scene_says_otherwise(tmp_path):
+    photos(tmp_path / "images", 9)
+    options = [{}, {"density": {"strategy": "original"}}, {"transients": "none"}]
+    wanted = [settle(look(tmp_path), config(train=o)).config.train.transients for o in options]
+    assert wanted == ["find", "none", "none"]
+    blocks = config(partition={"blocks": 2})
+    assert settle(look(tmp_path), blocks).config.train.transients == "none"
+    with pytest.raises(UserError, match="transients: find is not available in blocks"):
+        settle(look(tmp_path), config(partition={"blocks": 2}, train={"transients": "find"}))
+    picture(tmp_path / "masks" / "p00.png", mode="L")
+    settled = settle(look(tmp_path), config())
+    assert settled.config.train.transients == "none"
+    assert "only what the masks exclude" in settled.why["train.transients"]
+    again = settle(look(tmp_path), settled.config)
+    assert again.config == settled.config
+    forced = config(train={"transients": "find"})
+    assert settle(look(tmp_path), forced).config.train.transients == "find"
 
 
 def test_a_scene_is_divided_until_its_training_fits(tmp_path):

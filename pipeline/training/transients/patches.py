@@ -22,8 +22,9 @@ MIN_SUPPORT = 0.5
 #: The smallest patch, and its smallest core, shares of a view.
 MIN_PATCH, MIN_CORE = 4e-3, 1e-3
 #: In and around a patch, render and photograph have at most this correlation: someone who passes by
-#: has other edges than what is behind.
-MAX_CORRELATION = 0.65
+#: has other edges than what is behind. The second number is for patches that were found before,
+#: since training copies what they show into the scene.
+MAX_CORRELATION, MAX_CORRELATION_AGAIN = 0.65, 0.75
 #: A view with more in patches differs in light or pose: nothing in it is taken as transient.
 MAX_SHARE = 0.4
 #: A patch must have been found before in this share of its pixels.
@@ -39,8 +40,12 @@ def has_core(residual: Floats) -> bool:
     return int((residual > STRONG[0]).sum()) >= MIN_CORE * residual.size
 
 
-def contradicted(view: Comparison, others: Expected) -> Mask:
-    """(H, W) bool, the patches with a much larger residual than the other views have."""
+def contradicted(view: Comparison, others: Expected, before: Mask) -> Mask:
+    """(H, W) bool, the patches with a much larger residual than the other views have.
+
+    Args:
+        before: (H, W) bool, what the last search found.
+    """
     residual = view.residual
     usual = np.maximum(others.residual, FLOOR)
     evidence = others.support > MIN_SUPPORT
@@ -54,7 +59,10 @@ def contradicted(view: Comparison, others: Expected) -> Mask:
     )
     kept = (sizes >= MIN_PATCH * weak.size) & (cores >= MIN_CORE * weak.size)
     for label in np.flatnonzero(kept[1:]) + 1:
-        kept[label] = correlation(view, labels == label) < MAX_CORRELATION
+        patch = labels == label
+        again = confirmed(patch, before).any()
+        limit = MAX_CORRELATION_AGAIN if again else MAX_CORRELATION
+        kept[label] = correlation(view, patch) < limit
     found = kept[labels] & weak
     return found if found.mean() <= MAX_SHARE else np.zeros_like(found)
 

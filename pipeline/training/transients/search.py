@@ -30,7 +30,7 @@ RUN_SHARES = 0.12, 0.2, 0.5
 #: of their time on the search.
 MIN_VIEWS, MIN_EPOCHS = 8, 30
 #: Patches of together less than this share of all pixels are errors of the scene, and all are used.
-MIN_SCENE_SHARE = 1.5e-3
+MIN_SCENE_SHARE = 2e-3
 #: Images are reduced by a power of two, to at least so many pixels on the shorter side.
 SHORT_SIDE = 90
 #: A Gaussian explains transients if more than this share of its weight, and more than so many
@@ -80,10 +80,10 @@ class Transients:
         """
         evidence = gather(photographs)
         found = [
-            contradicted(view, expected(photographs, evidence, index))
+            contradicted(view, expected(photographs, evidence, index), before)
             if has_core(view.residual)
-            else np.zeros(view.residual.shape, bool)
-            for index, view in enumerate(evidence.views)
+            else np.zeros_like(before)
+            for index, (view, before) in enumerate(zip(evidence.views, self.found, strict=True))
         ]
         masks = [confirmed(now, before) for now, before in zip(found, self.found, strict=True)]
         if share_of(masks) < MIN_SCENE_SHARE:

@@ -24,6 +24,14 @@ def test_the_mask_loss_is_relative_to_the_pixels_that_are_not_ignored(tmp_path: 
     np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
     # What is in the ignored pixels of an overview is not empty: the block would fade.
     assert mask_gradient(replace(target, is_overview=True), 0.5) is None
+    # Nor is what someone who passes by hides: holes would be trained there.
+    assert target.ignored is not None
+    person = torch.zeros_like(target.ignored)
+    person[2:5, 1:3] = True
+    passed = replace(target, ignored=target.ignored | person, transient=person)
+    hidden = mask_gradient(passed, 0.5)
+    assert hidden is not None
+    np.testing.assert_array_equal(hidden > 0, mask == 0)
 
 
 def test_alpha_gradient_is_the_gradient_of_its_losses(tmp_path: Path) -> None:

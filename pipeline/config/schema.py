@@ -1,9 +1,8 @@
 """Every option of the product, one section a stage.
 
-The options that only an ablation needs are in ``pipeline.config.experiments``. The reference pages
-and ``config/config.yaml`` are generated from both modules. An option whose value is "auto" is
-settled by the plan from the scene. Importing this module costs pydantic and nothing heavier: the
-Snakefile imports it.
+Options that only an ablation needs are in ``pipeline.config.experiments``. The reference pages and
+``config/config.yaml`` are generated from both. An option whose value is "auto" is settled by the
+plan. Importing this module costs pydantic and nothing heavier: the Snakefile imports it.
 """
 
 from __future__ import annotations
@@ -357,9 +356,7 @@ class Evaluate(Section):
     """Test views compared with renders."""
 
     lpips_net: Literal["vgg", "alex", "none"] = Field(
-        "vgg",
-        description="Network of LPIPS, measured if `splatmake fetch lpips` has downloaded its "
-        "weights.",
+        "vgg", description="Network of LPIPS, measured if `splatmake fetch lpips` has fetched it."
     )
 
 
@@ -409,9 +406,8 @@ class Export(Section):
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
         "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
-        "train.transients left out, as masks of the photographs (PNG). Rendered from "
-        "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
-        "path).",
+        "train.transients left out, as masks of the photographs (PNG). Rendered from every view: "
+        "renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera path).",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(

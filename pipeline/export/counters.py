@@ -13,7 +13,8 @@ class ExportCounters(StageCounters):
 
     exported_gaussians: int = Field(
         ge=0,
-        description="Number of Gaussians in each exported file, after `experiments.export.min_opacity`.",
+        description="Number of Gaussians in each exported file, after "
+        "`experiments.export.min_opacity`.",
     )
 
     def headline(self) -> str:

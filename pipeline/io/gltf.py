@@ -50,7 +50,7 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
         raise UserError(
             f"a .glb file can hold 1 to 17 million Gaussians, found {count}",
             file=path,
-            fix="change experiments.export.min_opacity to export more or fewer of the faint Gaussians",
+            fix="change experiments.export.min_opacity, which leaves out faint Gaussians",
         )
     gaussians = Flipped(gaussians, LUF)
     columns = _columns(gaussians.sh_degree)

@@ -107,7 +107,8 @@ def _pieces(gaussians: GaussianSource, antialias: bool, version: int) -> Iterato
         other = ", write version 4 (spz4 in export.formats)" if count <= MAX_GAUSSIANS[4] else ""
         raise UserError(
             f"an SPZ file of version {version} can hold up to {limit} Gaussians, found {count}",
-            fix=f"export fewer of the faint Gaussians (experiments.export.min_opacity){other}, or write a PLY",
+            fix="export fewer of the faint Gaussians (experiments.export.min_opacity)"
+            f"{other}, or write a PLY",
         )
     bits = _fraction_bits(gaussians)
     header = Header(version, count, gaussians.sh_degree, bits, ANTIALIASED * antialias)

@@ -142,7 +142,7 @@ class TrainExperiments(Section):
         "raise it pass.",
     )
     appearance_size: Annotated[int, Field(ge=1, le=6), Unit("numbers")] = Field(
-        4, description="With train.appearance: embedding: size of a photograph's embedding."
+        6, description="With train.appearance: embedding: size of a photograph's embedding."
     )
     max_pose_change: Annotated[float, Field(gt=0, lt=1), Unit("radians, scene extents")] = Field(
         0.02,

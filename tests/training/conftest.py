@@ -20,9 +20,12 @@ from pipeline.render.views import render_view
 from pipeline.scene.views import View, resized
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop import session
+from pipeline.training.loop.result import TrainResult
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
 NUM_VIEWS = 6
+# The scene with someone who passes by: its views, and the pixels of the fourth that show them.
+CROWDED_VIEWS, PERSON = 10, (slice(20, 44), slice(30, 46))
 
 
 @dataclass
@@ -91,11 +94,6 @@ def camera_at(angle: float) -> View:
     return View("", "", None, WIDTH, HEIGHT, FOCAL, FOCAL, *half, pose, False)
 
 
-def resized_views(views: list[View], factor: int) -> list[View]:
-    """The views with ``factor`` times as many pixels along each side."""
-    return [resized(view, factor * view.width, factor * view.height) for view in views]
-
-
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
     folder: Path = tmp_path_factory.mktemp("tiny")
@@ -118,6 +116,34 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
     initial.sh.zero_()
     initial.opacity_logits.fill_(-1.0)
     return TinyScene(truth, initial, views, alpha_views, extent=3.3)
+
+
+@pytest.fixture(scope="session")
+def crowd(tmp_path_factory: pytest.TempPathFactory) -> tuple[TinyScene, list[View]]:
+    """A scene of an opaque ball, and its views with a bright square in the fourth one."""
+    folder = tmp_path_factory.mktemp("crowd")
+    truth = ball(150, 1)
+    truth.opacity_logits.fill_(4.0)
+    plain, crowded = [], []
+    for index in range(CROWDED_VIEWS):
+        view = resized(camera_at(index * 2 * np.pi / CROWDED_VIEWS), 2 * WIDTH, 2 * HEIGHT)
+        rgb = np.rint(render_view(truth, view).rgb * 255).astype(np.uint8)
+        for views, name in ((plain, f"{index}.png"), (crowded, f"{index}c.png")):
+            if views is crowded and index == 3:
+                rgb = rgb.copy()
+                rgb[PERSON] = (250, 20, 240)
+            Image.fromarray(rgb).save(folder / name)
+            views.append(replace(view, name=f"{index}.png", image=str(folder / name)))
+    initial = truth.clone()
+    initial.sh.mul_(0.8)
+    return TinyScene(truth, initial, plain, [], extent=3.3), crowded
+
+
+def person_error(result: TrainResult, scene: TinyScene) -> float:
+    """The mean absolute error of the fourth view's square against the scene without it."""
+    view = scene.views[3]
+    photo = np.asarray(Image.open(view.image))[PERSON] / 255.0
+    return float(np.abs(render_view(result.gaussians, view).rgb[PERSON] - photo).mean())
 
 
 @contextmanager

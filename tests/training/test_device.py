@@ -11,15 +11,17 @@ import pytest
 import torch
 
 from pipeline.config.settled import TrainOptions
+from pipeline.scene.views import View
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
 from pipeline.training.run import TrainingRun
+from pipeline.training.transients import search
 from tests.render.scenes import relative
 from tests.tools import need_gpu
-from tests.training.conftest import TinyScene, tiny_config
+from tests.training.conftest import TinyScene, person_error, tiny_config
 
 STEPS = 60
 
@@ -153,3 +155,20 @@ def stop_after(step: int):
         original(state)
 
     return record
+
+
+def test_who_passes_by_is_left_out_on_the_gpu(
+    crowd: tuple[TinyScene, list[View]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images stay in the memory of the device: those with other masks are copied again."""
+    monkeypatch.setattr(search, "MIN_EPOCHS", 5)
+    scene, views = crowd
+    errors = {}
+    for wanted in ("find", "none"):
+        density = {"max_gaussians": 200}
+        config = tiny_config(120, device="gpu", transients=wanted, density=density)
+        inputs = Inputs(views, scene.initial, scene.extent)
+        result = train(inputs, TrainingRun(config, tmp_path / wanted, seed=3, threads=1))
+        assert (result.transients or {}).keys() >= ({"3.png"} if wanted == "find" else set())
+        errors[wanted] = person_error(result, scene)
+    assert errors["find"] < 0.5 * errors["none"]

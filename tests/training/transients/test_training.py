@@ -8,46 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from pipeline.render.views import render_view
 from pipeline.scene.views import View
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.scene import transients_lines
 from pipeline.training.transients import search
 from pipeline.training.transients.search import Transients
 from tests.training.conftest import (
+    CROWDED_VIEWS,
+    PERSON,
     TinyScene,
-    ball,
-    camera_at,
     killed_in_step,
-    resized_views,
+    person_error,
     tiny_config,
 )
 from tests.training.loop.test_trainer import assert_same, run
 
-VIEWS, PERSON, STEPS = 10, (slice(20, 44), slice(30, 46)), 120
-
-
-@pytest.fixture(scope="module")
-def crowd(tmp_path_factory: pytest.TempPathFactory) -> tuple[TinyScene, list[View]]:
-    """A scene of an opaque ball, and its views with a bright square in the fourth one."""
-    folder = tmp_path_factory.mktemp("crowd")
-    truth = ball(150, 1)
-    truth.opacity_logits.fill_(4.0)
-    plain, crowded = [], []
-    for index in range(VIEWS):
-        view = resized_views([camera_at(index * 2 * np.pi / VIEWS)], 2)[0]
-        rgb = np.rint(render_view(truth, view).rgb * 255).astype(np.uint8)
-        for views, name in ((plain, f"{index}.png"), (crowded, f"{index}c.png")):
-            if views is crowded and index == 3:
-                rgb = rgb.copy()
-                rgb[PERSON] = (250, 20, 240)
-            Image.fromarray(rgb).save(folder / name)
-            views.append(replace(view, name=f"{index}.png", image=str(folder / name)))
-    initial = truth.clone()
-    initial.sh.mul_(0.8)
-    return TinyScene(truth, initial, plain, [], extent=3.3), crowded
+STEPS = 120
 
 
 @pytest.fixture(autouse=True)
@@ -64,13 +41,6 @@ def trained(
     return run(scene, folder, config, views if crowded else scene.views)
 
 
-def error(result: TrainResult, scene: TinyScene) -> float:
-    """The mean absolute error of the fourth view's square against the scene without it."""
-    view = scene.views[3]
-    photo = np.asarray(Image.open(view.image))[PERSON] / 255.0
-    return float(np.abs(render_view(result.gaussians, view).rgb[PERSON] - photo).mean())
-
-
 def test_a_person_in_one_view_is_left_out_of_the_loss(crowd, tmp_path: Path) -> None:
     scene, views = crowd
     result = trained(crowd, tmp_path / "find", "find")
@@ -84,7 +54,7 @@ def test_a_person_in_one_view_is_left_out_of_the_loss(crowd, tmp_path: Path) -> 
     assert "left out of the loss (train.transients)" in line
     without = trained(crowd, tmp_path / "none", "none")
     assert without.transients is None
-    assert error(result, scene) < 0.5 * error(without, scene)
+    assert person_error(result, scene) < 0.5 * person_error(without, scene)
 
 
 def test_a_static_scene_has_the_bits_of_a_run_without_the_search(crowd, tmp_path: Path) -> None:
@@ -100,7 +70,7 @@ def test_killed_between_searches_and_resumed_gives_the_same_bits(
     """The searches are after steps 14, 24 and 60; each has a backward pass for each view."""
     whole = trained(crowd, tmp_path / "whole", "find")
     searches = sum(step > round(share * STEPS) for share in search.RUN_SHARES)
-    with killed_in_step(monkeypatch, step + searches * VIEWS):
+    with killed_in_step(monkeypatch, step + searches * CROWDED_VIEWS):
         trained(crowd, tmp_path / "cut", "find")
     resumed = trained(crowd, tmp_path / "cut", "find")
     assert_same(whole, resumed)

@@ -42,7 +42,7 @@ CHUNK_STAGES = ("extract", "pairs", "match")
 
 def skipped(plan: Plan) -> list[str]:
     """The stages that the plan leaves out, but for those of large scenes and on demand."""
-    rare = (*BLOCK_STAGES, *CHUNK_STAGES, "dense")
+    rare = (*BLOCK_STAGES, *CHUNK_STAGES, "dense", "holes")
     return [n for n, stage in plan.stages.items() if not stage.run and n not in rare]
 
 

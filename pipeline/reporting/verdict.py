@@ -33,7 +33,7 @@ _GROUPS = {
     "Finding where they were taken": (
         *("features", "extract", "pairs", "match", "matches", "sfm", "refine", "undistort"),
     ),
-    "Training": ("dense", "init", "coarse", "partition", "block", "polish", "train"),
+    "Training": ("dense", "init", "coarse", "partition", "block", "polish", "train", "holes"),
     "Measured result": ("evaluate", "coverage"),
     "Files": ("export",),
 }

@@ -10,7 +10,10 @@ from stages.workflow.registry import STAGES
 from tests.plans import full_plan
 
 ON_GPU = Config.model_validate({"train": {"device": "gpu:0"}})
-RENDERING = {"coarse", "partition", "block", "polish", "train", "evaluate", "coverage", "export"}
+RENDERING = {
+    *("coarse", "partition", "block", "polish", "train"),
+    *("holes", "evaluate", "coverage", "export"),
+}
 
 
 def test_stages_that_render_use_the_gpu() -> None:

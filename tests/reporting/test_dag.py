@@ -48,9 +48,9 @@ def test_skipped_stages_are_below_with_their_reason():
 
 
 def test_arrows_are_the_inputs_without_implied_ones():
-    """All run: a chain, and export beside coverage between train and report."""
+    """All run: a chain, and holes beside coverage, before export and report."""
     boxes, root = drawn(plan())
-    assert boxes["coverage"][0] == boxes["export"][0]
+    assert boxes["coverage"][0] == boxes["holes"][0] < boxes["export"][0]
     heads = [p for p in root.iter(f"{SVG}path") if p.get("class") == "head"]
     assert len(heads) == len(STAGES)  # the chain of eleven, around export, and to refine
     assert len([p for p in drawn(plan("decode"))[1].iter(f"{SVG}path")]) == 2 * (len(STAGES) - 1)

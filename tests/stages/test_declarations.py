@@ -134,7 +134,7 @@ def test_configurations_share_the_stages_before_their_difference():
     """The stages after it read options of train as well."""
     other = Config.model_validate({"train": {"sh_degree": 0}})
     blocks = {"coarse", "partition", "block", "polish"}
-    after = blocks | {"train", "evaluate", "coverage", "export", "report"}
+    after = blocks | {"train", "holes", "evaluate", "coverage", "export", "report"}
     # The report does not read this option.
     assert differing(full_plan(Config()), full_plan(other)) == after - {"report"}
 

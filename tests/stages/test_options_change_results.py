@@ -60,6 +60,7 @@ DARK = under(poses="keep", experiments__train__sh0_learning_rate=1.0)
 LARGE = under(poses="keep", views__max_long_side_px=200)
 FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_gaussians=320)
 BLOCKS = under(poses="keep", partition__blocks=2, export__formats=["ply", "blocks"])
+FILL = under(poses="keep", train__background="fill", train__density__max_gaussians=1500)
 DENSE = under(poses="keep", init__method="dense", export__formats=["dense_points", "dense_maps"])
 MESH = under(poses="keep", export__formats=["mesh"])
 VIDEO = under(
@@ -150,7 +151,7 @@ FLIPS = {
     f"{_M}.growth_share": Flip(0.2, MCMC),
     f"{_M}.noise": Flip(False, MCMC),
     "partition.blocks": Flip(3, BLOCKS),
-    "holes.fill": Flip("inpaint", POSED),
+    "holes.fill": Flip("inpaint", FILL),
     "evaluate.lpips_net": Flip("none", POSED),
     "export.formats": Flip(["ply"], POSED),
     "export.sh_degree": Flip(1, POSED),
@@ -306,6 +307,21 @@ def test_depth_maps_have_the_same_bits_at_any_number_of_threads(outputs):
     exported = outputs("dense", "photos", DENSE, "export")
     assert "dense_points.ply" in exported
     assert sum(name.startswith("dense_maps/") for name in exported) == len(names)
+
+
+def test_filled_holes_have_the_same_bits_at_any_number_of_threads_and_change_no_measure(outputs):
+    filled = with_option(FILL, "holes.fill", "inpaint")
+    for stage in ("holes", "export", "report"):
+        expected = outputs("holes", "photos", filled, stage)
+        assert expected, stage
+        assert outputs("holes", "photos", filled, stage, threads=2) == expected, stage
+    for stage in ("evaluate", "coverage"):
+        assert outputs("holes", "photos", filled, stage) == outputs("fill", "photos", FILL, stage)
+    exported = [
+        outputs(run, "photos", o, "export") for run, o in (("holes", filled), ("fill", FILL))
+    ]
+    differing = {name for name in exported[0] if exported[0][name] != exported[1][name]}
+    assert differing == {"point_cloud.ply", "point_cloud.spz", "frame.json"}
 
 
 @pytest.mark.parametrize(

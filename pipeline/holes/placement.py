@@ -43,6 +43,8 @@ DEPTH_FACTOR, DEPTH_STEPS = 1.06, 20
 #: What is in front of a hole seldom continues into it: a pixel counts by this power of its depth,
 #: relative to this percentile of the depths.
 FAR_POWER, FAR_PERCENTILE = 4.0, 75.0
+#: The width in pixels of the edges of holes, where the background shines through surfaces.
+EDGE_PX = 4
 #: Surfaces that no photograph sees are smeared, or invented: they count by this factor.
 UNSEEN_WEIGHT = 0.05
 #: A surface farther than this many times the background depth of the training views is sky.
@@ -108,10 +110,12 @@ def _without_specks(hole: Bools) -> Bools:
 
 def context_weights(found: HoleView, background_depth: float) -> Doubles:
     """(H, W) how much each pixel counts where colours and depths are continued into the holes: 0 to
-    1, more for far surfaces, and for what photographs see; 0 in holes, and for sky where there is
-    any surface."""
+    1, more for far surfaces, and for what photographs see; 0 in holes and at their edges, and for
+    sky where there is any surface."""
     depth = found.probe.depth.astype(np.float64)
-    surface = ~found.hole & (depth < SKY_FACTOR * background_depth)
+    square = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    edge = cv2.dilate(found.hole.astype(np.uint8), square) > 0
+    surface = ~edge & (depth < SKY_FACTOR * background_depth)
     if not surface.any():
         return np.where(found.hole, 0.0, 1.0)
     far = float(np.percentile(depth[surface], FAR_PERCENTILE))

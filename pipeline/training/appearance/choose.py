@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -55,7 +55,7 @@ def choose_appearance(
     points: NDArray[np.float64],
     wanted: str,
     *,
-    cameras: Sequence[str],
+    cameras: Mapping[str, str],
     has_alpha: bool,
     in_blocks: bool,
 ) -> AppearanceChoice:
@@ -65,7 +65,7 @@ def choose_appearance(
         views: All views.
         points: (N, 3) of the scene, for a model without points.
         wanted: The option ``train.appearance``.
-        cameras: The camera group of each photograph.
+        cameras: The camera group of each photograph by name.
         has_alpha: Whether photographs have alpha. If so, exposure is not modelled.
         in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
@@ -76,7 +76,7 @@ def choose_appearance(
         training = [view for view in views if not view.is_test]
         disagreement = colour_disagreement(training, model, points)
         choice.counters["colour_disagreement"] = round(disagreement, 4)
-        collection = is_collection(cameras)
+        collection = is_collection(list(cameras.values()))
         limit = COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE
         if disagreement > limit:
             choice.embeddings = True
@@ -85,16 +85,20 @@ def choose_appearance(
                 "each has an appearance embedding (train.appearance)"
             )
             return choice
-    _choose_light(choice, views, model, wanted)
+    _choose_light(choice, views, model, wanted, cameras)
     return choice
 
 
 def _choose_light(
-    choice: AppearanceChoice, views: Sequence[View], model: Reconstruction, wanted: str
+    choice: AppearanceChoice,
+    views: Sequence[View],
+    model: Reconstruction,
+    wanted: str,
+    cameras: Mapping[str, str],
 ) -> None:
     """Add the light of the photographs to ``choice``: gains for all if ``wanted`` is ``exposure``,
     else the parts of the model for which a sample of the photographs is evidence."""
-    sample = observe(sample_views(views), model)
+    sample = observe(sample_views(views), model, cameras)
     parts, uses_gains = choose_parts(sample), wanted == "exposure"
     if wanted == "measured":
         spread = solve_gains(sample.point, sample.photo, sample.y, sample.num_photos).spread
@@ -109,7 +113,7 @@ def _choose_light(
                 )
     if not uses_gains and parts == Parts():
         return
-    seen = observe(views, model)
+    seen = observe(views, model, cameras)
     fitted = fit_light(seen, parts)
     light = trusted(seen, fitted) if uses_gains else without_gains(fitted)
     if uses_gains:

@@ -42,8 +42,9 @@ LARGE_GAP, LOW_PSNR = 6.0, 25.0
 PNG_LEVEL = 1
 
 EXPOSURE_PROTOCOL = (
-    "renders multiplied by each photograph's gains (one per channel), which are measured at the "
-    "sparse points, in test photographs as well; psnr_without_gains is without this"
+    "renders multiplied by each photograph's gains (one per channel; vignetting and a slope where "
+    "modelled), which are measured at the sparse points, in test photographs as well; "
+    "psnr_without_gains is without this"
 )
 APPEARANCE_PROTOCOL = (
     "the appearance of each test photograph is fitted on its left half and measured on its "

@@ -9,7 +9,7 @@ alternating means over points and medians over views; the geometric mean of the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ MIN_OBSERVATIONS = 20
 SAMPLE = 64
 #: The number of alternations of the solver.
 ROUNDS = 20
+NO_LENSES: Mapping[str, str] = {}
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -107,20 +108,25 @@ class Observations:
         )
 
 
-def observe(views: Sequence[View], model: Reconstruction) -> Observations:
+def observe(
+    views: Sequence[View], model: Reconstruction, lenses: Mapping[str, str] = NO_LENSES
+) -> Observations:
     """The colours of ``views`` at the observations of ``model``.
 
     Args:
         views: The views of images of ``model``, matched by name. They may have another resolution
             than the model's cameras.
+        lenses: The camera group of each photograph by name, which tells cameras apart that share
+            the intrinsics of ``model``; empty if unknown.
     """
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
     numbers = {image.name: number for number, image in model.images.items()}
     groups: dict[str, int] = {}
     photos = [groups.setdefault(view.source or view.name, len(groups)) for view in views]
-    cameras: dict[int, int] = {}
-    bodies = [cameras.setdefault(view.camera_id, len(cameras)) for view in views]
+    cameras: dict[tuple[int, str], int] = {}
+    keys = [(view.camera_id, lenses.get(view.name, "")) for view in views]
+    bodies = [cameras.setdefault(key, len(cameras)) for key in keys]
     point_of, view_of, positions = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], []
     colours = [np.zeros((0, 3))]
     positions.append(np.zeros((0, 2)))

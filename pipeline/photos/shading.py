@@ -29,7 +29,7 @@ from pipeline.scene.exposure import ViewLight
 
 #: Vignetting and slopes are used if they lower the variance of held-out observations by this share
 #: (a lens has two numbers for all photographs, each photograph two slopes) ...
-MIN_VIGNETTING, MIN_SLOPES = 0.01, 0.1
+MIN_VIGNETTING, MIN_SLOPES = 0.05, 0.1
 #: ... and if it is visible: stops at half a diagonal from the principal point.
 VISIBLE_STOPS = 0.1
 #: Gains are used if at least this share of their squares remains of those that are ``trusted``.
@@ -43,7 +43,7 @@ RELAXATION = 1.5
 #: Huber's bound in robust standard deviations, and its ratio to the median of absolute values.
 HUBER, TO_DEVIATION = 1.5, 1.4826
 #: Weights of the prior that there is no vignetting and no slope, squared half diagonals.
-VIGNETTING_PRIOR, SLOPE_PRIOR = 1.0, 2.0
+VIGNETTING_PRIOR, SLOPE_PRIOR = 0.5, 0.5
 #: The darkest vignetting at the corner that is believed, log2 of display values.
 MAX_VIGNETTING = 2.0
 #: Photographs of a camera from which its vignetting, or its typical gain, can be known.

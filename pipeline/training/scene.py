@@ -99,7 +99,7 @@ def train_scene(
         scene.model,
         initial.means.double().numpy(),
         run.options.appearance,
-        cameras=[photo.camera_group for photo in manifest.photos],
+        cameras={photo.name: photo.camera_group for photo in manifest.photos},
         has_alpha=any(photo.alpha for photo in manifest.photos),
         in_blocks=run.is_part,
     )

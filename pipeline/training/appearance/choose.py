@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,7 +59,7 @@ def choose_appearance(
     points: NDArray[np.float64],
     wanted: str,
     *,
-    cameras: Sequence[str],
+    cameras: Mapping[str, str],
     has_alpha: bool,
     in_blocks: bool,
 ) -> AppearanceChoice:
@@ -69,7 +69,7 @@ def choose_appearance(
         views: All views.
         points: (N, 3) of the scene, for a model without points.
         wanted: The option ``train.appearance``.
-        cameras: The camera group of each photograph.
+        cameras: The camera group of each photograph by name.
         has_alpha: Whether photographs have alpha. If so, exposure is not modelled.
         in_blocks: Whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
@@ -79,7 +79,7 @@ def choose_appearance(
         choice.gains = _gains_besides_embeddings(training, model)
     if wanted in ("none", "embedding") or has_alpha:
         return choice
-    collection = is_collection(cameras)
+    collection = is_collection(list(cameras.values()))
     if wanted == "measured" and in_blocks and collection:
         choice.decisions.append(
             "photographs by many cameras may be in different light, but a scene in blocks has no "
@@ -98,16 +98,20 @@ def choose_appearance(
             )
             choice.gains = _gains_besides_embeddings(training, model)
             return choice
-    _choose_light(choice, views, model, wanted)
+    _choose_light(choice, views, model, wanted, cameras)
     return choice
 
 
 def _choose_light(
-    choice: AppearanceChoice, views: Sequence[View], model: Reconstruction, wanted: str
+    choice: AppearanceChoice,
+    views: Sequence[View],
+    model: Reconstruction,
+    wanted: str,
+    cameras: Mapping[str, str],
 ) -> None:
     """Add the light of the photographs to ``choice``: gains for all if ``wanted`` is ``exposure``,
     else the parts of the model for which a sample of the photographs is evidence."""
-    sample = observe(sample_views(views), model)
+    sample = observe(sample_views(views), model, cameras)
     parts, uses_gains = choose_parts(sample), wanted == "exposure"
     if wanted == "measured":
         spread = solve_gains(sample.point, sample.photo, sample.y, sample.num_photos).spread
@@ -122,7 +126,7 @@ def _choose_light(
                 )
     if not uses_gains and parts == Parts():
         return
-    seen = observe(views, model)
+    seen = observe(views, model, cameras)
     fitted = fit_light(seen, parts)
     light = trusted(seen, fitted) if uses_gains else without_gains(fitted)
     if uses_gains:

@@ -31,7 +31,7 @@ def choose(
         model,
         points,
         wanted,
-        cameras=["one"] * len(views),
+        cameras={view.name: "one" for view in views},
         has_alpha=has_alpha,
         in_blocks=in_blocks,
     )
@@ -75,7 +75,7 @@ def test_a_collection_by_many_cameras_needs_less_evidence(
         choose_module, "colour_disagreement", lambda *_: ColourDisagreement(0.2, 1.0)
     )
     scene = photographs(tmp_path, [0] * 8, ALIKE)
-    groups = [f"{number % cameras}" for number in range(8)]
+    groups = {view.name: f"{number % cameras}" for number, view in enumerate(scene[0])}
     found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
     assert found.embeddings == (cameras == 8)
 

@@ -4,7 +4,7 @@ Both are measured from the colours of points at different places of images. With
 value of point p in photograph i of camera k at position (x, y) (``scene.exposure.ViewLight``), the
 model is y = c_p + g_i + v_k(r^2) + s_i . (x, y). As in Goldman and Chen (2005, *Vignette and
 Exposure Calibration and Compensation*), v is a polynomial in r^2, of two terms. It is 0 at the
-principal point and does not increase with r.
+principal point and does not increase with r. The mean of the slopes is 0.
 
 A part of the model is used if it predicts observations of points that it was not fitted to: see
 ``choose_parts``. Gains are kept as far as parts of the image agree on them: see ``trusted``.
@@ -218,7 +218,11 @@ def _slopes(seen: Observations, light: Light) -> Array:
     a, b, d = total(x * x) + SLOPE_PRIOR, total(x * y), total(y * y) + SLOPE_PRIOR
     p, q = total(x * e), total(y * e)
     slopes = np.stack([p * d - q * b, q * a - p * b], axis=1) / (a * d - b * b)[:, None]
-    slopes[np.bincount(photo, minlength=count) < MIN_OBSERVATIONS] = 0.0
+    measured = np.bincount(photo, minlength=count) >= MIN_OBSERVATIONS
+    if measured.any():
+        # The shading of the scene, such as a bright floor, makes slopes that are alike.
+        slopes -= slopes[measured].mean(axis=0)
+    slopes[~measured] = 0.0
     return slopes
 
 

@@ -49,11 +49,12 @@ def lit(*, gains: float = 0.0, slopes: float = 0.0) -> Light:
     rng = np.random.default_rng(7)
     same = no_light(observations())
     shown = rng.normal(0, gains / GAMMA, (PHOTOS, 3))
+    ramps = rng.normal(0, slopes / GAMMA, (PHOTOS, 2))
     return replace(
         same,
         gains=shown - shown.mean(axis=0),
         vignetting=np.array([[0.0, 0.0], [-0.3, 0.3 - 1 / GAMMA]]),
-        slopes=rng.normal(0, slopes / GAMMA, (PHOTOS, 2)),
+        slopes=ramps - ramps.mean(axis=0),
     )
 
 

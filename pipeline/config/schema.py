@@ -297,7 +297,7 @@ class Train(Section):
         "points; embedding: the colours of Gaussians depend on a vector for each photograph, for "
         "another light or weather, and test views are measured on the right half after a fit on "
         "the left. measured: embedding if photographs disagree on colours after exposure, else "
-        "exposure if exposures differ. measured, exposure: also vignetting and ramps of brightness.",
+        "exposure if exposures differ. measured, exposure: also vignetting and brightness ramps.",
     )
     transients: Literal["auto", "find", "none"] = Field(
         "auto",

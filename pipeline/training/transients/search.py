@@ -70,7 +70,9 @@ class Transients:
         """
         if run_length < MIN_EPOCHS * len(self.masks):
             return False
-        return any(round(share * self.steps) in steps for share in RUN_SHARES)
+        due = [share for share in RUN_SHARES if round(share * self.steps) in steps]
+        # The last search only confirms what the one before has found.
+        return bool(due) and (due[0] < RUN_SHARES[-1] or any(mask.any() for mask in self.found))
 
     def search(self, photographs: ReducedPhotographs) -> Tensor:
         """Find the patches that the last search found as well, and leave them out of the loss.

@@ -246,6 +246,20 @@ MUTANTS: dict[str, Mutant] = {
         "the typical photograph's gain not 1",
         ("tests/photos/test_exposure.py",),
     ),
+    "vignetting_of_all": Mutant(
+        "pipeline/photos/shading.py",
+        "rows = np.flatnonzero(seen.camera == camera)",
+        "rows = np.flatnonzero(seen.camera >= 0)",
+        "one vignetting for the lenses of all cameras",
+        ("tests/photos/test_shading.py",),
+    ),
+    "untrusted_gains": Mutant(
+        "pipeline/photos/shading.py",
+        "return max(error, *halves)",
+        "return 0.0",
+        "gains kept on which the halves of an image disagree",
+        ("tests/photos/test_shading.py",),
+    ),
     "split_off_by_one": Mutant(
         "pipeline/scene/views.py",
         "return every > 0 and index % every == 0",

@@ -280,7 +280,7 @@ def test_frame_json_describes_the_coordinate_frame(scene):
     found = json.loads((out / "frame.json").read_text())
     assert found["up"] == [0, -1, 0]
     assert found["cameras"]["centre"] == [-4, 0, -4]
-    assert found["gaussians"] == {"count": 50, "sh_degree": 3}
+    assert found["gaussians"] == {"count": 50, "sh_degree": 3, "num_invented": 0}
     # Trained on random backgrounds, shown on white.
     assert found["render"]["background"] == [1, 1, 1]
     turned = {f"point_cloud{end}" for end in (".spz", "_v4.spz", ".glb")}

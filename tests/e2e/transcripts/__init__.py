@@ -20,8 +20,10 @@ _MASKS = (
     (r"-?\d+\.\d+|\d+%|\d+(?= inliers)", "<number>"),
     (r"\b\d{1,3}(,\d{3})+\b|\b\d{3,}\b(?! steps)", "<number>"),
 )
-# A line a minute for a job that runs.
-_PROGRESS = re.compile(r"  \S+ +(\S+ +)?(running$|.*: \w+ .* of .* left)|.* finished, \d+ to do$")
+# A line a minute for a job that runs; the time left is in it when it is known.
+_PROGRESS = re.compile(
+    r"  \S+ +(\S+ +)?(running$|.*: \w+ \S+ of \S+( .*left)?$)|.* finished, \d+ to do$"
+)
 
 
 def masked(text: str) -> str:

@@ -84,7 +84,7 @@ def test_a_collection_by_many_cameras_needs_less_evidence(
 def test_a_collection_that_cannot_be_compared_has_embeddings(tmp_path: Path, cameras: int) -> None:
     """Photographs of another time have few matches. One camera's are not suspected."""
     scene = photographs(tmp_path, [0, 1] * 4, ALIKE, tracks="none", shift=0.05)
-    groups = [f"{number % cameras}" for number in range(8)]
+    groups = {view.name: f"{number % cameras}" for number, view in enumerate(scene[0])}
     found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
     assert found.embeddings == (cameras == 8)
     assert ("too few common points" in "".join(found.decisions)) == (cameras == 8)
@@ -92,6 +92,6 @@ def test_a_collection_that_cannot_be_compared_has_embeddings(tmp_path: Path, cam
 
 def test_a_collection_in_blocks_is_told_why_there_are_no_embeddings(tmp_path: Path) -> None:
     scene = photographs(tmp_path, [0, 1] * 4, ALIKE)
-    groups = [str(number) for number in range(8)]
+    groups = {view.name: view.name for view in scene[0]}
     found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=True)
     assert not found.embeddings and "partition.blocks: 1" in found.decisions[0]

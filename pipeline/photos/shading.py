@@ -334,7 +334,7 @@ def _uncertainty(residual: Array, position: Array, view: Indices, in_parts: bool
     many = np.bincount(cell)
     weight = (many / many.sum())[:, None]
     centre = (weight * cells).sum(axis=0)
-    # Of a mean of cells with unequal weights.
+    # The variance of a mean of cells with unequal weights.
     variance = (weight**2 * np.square(cells - centre)).sum(axis=0)
     effective = 1 / float((weight**2).sum())
     error = float(np.sqrt(variance.sum() * effective / max(effective - 1, 1e-3)))

@@ -61,7 +61,7 @@ class ViewLight(JsonObject):
         plane = plane.astype(np.float32)
         if any(self.vignetting):
             plane *= _vignetting_plane(self.vignetting, tuple(x), tuple(y))
-        # By channel: numpy is several times slower where the last axis has only three entries.
+        # One channel at a time: numpy is slow where the last axis has only three entries.
         factors = np.empty((height, width, 3), np.float32)
         for channel in range(3):
             np.multiply(plane, gain[channel], out=factors[..., channel])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Holes, Split
 from pipeline.holes.counters import HolesCounters
+from pipeline.plan.hole_painter import check_hole_painter
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -22,6 +23,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     fill = settled.config.holes.fill
     if fill == "none":
         return StagePlan(run=False, reason="holes.fill: none")
+    check_hole_painter(fill)
     how = "inpainting" if fill == "inpaint" else "the command of holes.fill"
     return StagePlan(run=True, reason=f"invents what no photograph shows, painted by {how}")
 

@@ -56,7 +56,7 @@ WORLDS: dict[str, Conditions] = {
     "ramps": replace(CLEAN, ramp=0.7),
     "lights": replace(CLEAN, lights=5),
     "collection": replace(CLEAN, lights=5, exposures=3, lenses=2),
-    "walkers": replace(CLEAN, walkers=0.4),
+    "walkers": replace(CLEAN, walkers=0.25),
     "holes": replace(CLEAN, withhold=0.2),
 }
 
@@ -84,6 +84,7 @@ class Setup:
             {
                 "steps": self.steps,
                 "appearance": self.appearance,
+                "transients": "find",
                 "density": Gradient(max_gaussians=self.gaussians),
             }
         )

@@ -101,18 +101,17 @@ class ViewRenderer:
         """The render of a view, with its refined pose and its appearance."""
         pixels, options = load_view(view), self._options
         photo, shown, own = pixels.over(self.protocol.background), self.gaussians, None
+        name, light = view.name, self.gains.of(view.name)
         if self.appearance is not None:
             from pipeline.training.appearance.fit import in_photograph
 
             shown = in_photograph(
-                self.gaussians, self.appearance, view, photo, pixels.mask, options
+                self.gaussians, self.appearance, view, photo, pixels.mask, options, light
             )
-        name = view.name
         if self.train.refine_poses and view.is_test:
             from pipeline.training.cameras.fit_pose import fit_pose
 
-            light, weight = self.gains.of(name), self.train.ssim_loss_weight
-            extent = self.protocol.extent
+            extent, weight = self.protocol.extent, self.train.ssim_loss_weight
             view = fit_pose(shown, view, photo, pixels.mask, light, options, extent, weight)
         if name in self._fitted:
             own = render_rgb(self.gaussians, view, options)

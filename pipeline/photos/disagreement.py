@@ -2,6 +2,8 @@
 
 Photographs of one scene in one light agree except for noise, highlights and inaccurate points. In
 photographs of another time of day, weather or processing, colours differ from point to point.
+Neighbours are compared: between views from far apart, highlights move, and points that are not
+quite on the surface have other colours.
 
 Photographs in very different light have few matches, so that tracks hardly connect them. Points
 that one of several photographs from the same place observes are therefore observed by all of them:
@@ -17,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.photos.exposure import BRIGHT, DARK, MIN_OBSERVATIONS, sample_views, solve_gains
+from pipeline.photos.exposure import BRIGHT, DARK, MIN_OBSERVATIONS, sample_views
 from pipeline.photos.load import load_view
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
@@ -26,6 +28,9 @@ from pipeline.scene.views import View
 # depth of the nearest tenth of what they see, and their viewing directions differ by less than this
 # angle: features then move by a few pixels.
 SAME_PLACE, SAME_DIRECTION = 0.005, np.radians(3.0)
+# A view is compared with so many others that have enough points in common, the nearest first: by
+# the distance of the centres as a share of the depth, and the angle between the viewing directions.
+NEIGHBOURS = 4
 # Colours are means over squares of this side in pixels: points are not more accurate.
 WINDOW = 5
 # The ratio of the standard deviation to the median absolute value of a normal distribution.
@@ -53,10 +58,10 @@ class ColourDisagreement:
     """How far photographs disagree on colours.
 
     Attributes:
-        value: The robust standard deviation of log2 of the colours of a point over the photographs,
-            after gains that compensate exposure and white balance; the median over the measured
+        value: The robust standard deviation of log2 of the colours of a point over a view and its
+            ``NEIGHBOURS``, apart from exposure and white balance; the median over the measured
             views, 0 without any.
-        measured: The share of a sample of the views that see enough points which other views see.
+        measured: The share of a sample of the views that see enough points which another view sees.
     """
 
     value: float
@@ -76,7 +81,8 @@ def colour_disagreement(
     found = observed_colours(views, model, points)
     if not len(found.point):
         return ColourDisagreement(0.0, 0.0)
-    return _spread(found.point, found.view, found.colours, len(views))
+    tracked = len(model.points) > 0
+    return _compare(found, views, np.asarray(model.points.xyz if tracked else points, np.float64))
 
 
 def observed_colours(
@@ -117,24 +123,45 @@ def observed_colours(
     )
 
 
-def _spread(
-    point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
-) -> ColourDisagreement:
-    """The disagreement; the arguments are those of ``solve_gains``."""
-    _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
-    several = observed[point] >= 2
-    point, view, y = point[several], view[several], y[several]
-    if not len(point):
-        return ColourDisagreement(0.0, 0.0)
-    y = y - np.log2(solve_gains(point, view, y, count).gains)[view]
-    _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(point, y[:, c]) for c in range(3)], axis=1) / observed[:, None]
-    # The mean of n values is closer to each of them than the truth, by sqrt((n - 1) / n).
-    residual = (y - means[point]) * np.sqrt(observed / (observed - 1.0))[point][:, None]
-    of_views = [residual[view == v] for v in range(count)]
-    found = [np.median(np.abs(r)) for r in of_views if len(r) >= MIN_OBSERVATIONS]
-    value = float(np.median(found)) * TO_DEVIATION if found else 0.0
-    return ColourDisagreement(value, len(found) / count)
+def _compare(found: ObservedColours, views: Sequence[View], means: Array) -> ColourDisagreement:
+    """The disagreement of views with their neighbours.
+
+    Args:
+        means: (N, 3) the positions of the points.
+    """
+    rows = [np.flatnonzero(found.view == index) for index in range(len(views))]
+    centres = np.array([view.centre for view in views])
+    axes = np.array([view.world_to_camera[2, :3] for view in views])
+    values = []
+    for index, own in enumerate(rows):
+        if len(own) < MIN_OBSERVATIONS:
+            continue
+        depth = np.median(np.linalg.norm(means[found.point[own]] - centres[index], axis=1))
+        angles = np.arccos((axes * axes[index]).sum(1).clip(-1, 1))
+        distances = np.linalg.norm(centres - centres[index], axis=1) / max(depth, 1e-12) + angles
+        differences = []
+        for other in np.argsort(distances, kind="stable"):
+            if other != index and (of_pair := _difference(found, own, rows[other])) is not None:
+                differences.append(of_pair)
+            if len(differences) == NEIGHBOURS:
+                break
+        if differences:
+            values.append(float(np.sqrt(np.mean(np.square(differences)))))
+    return ColourDisagreement(float(np.median(values)) if values else 0.0, len(values) / len(views))
+
+
+def _difference(
+    found: ObservedColours, one: NDArray[np.int64], other: NDArray[np.int64]
+) -> float | None:
+    """How far two views, of which these are the observations, disagree; None without enough common
+    points."""
+    common, i, j = np.intersect1d(found.point[one], found.point[other], return_indices=True)
+    if len(common) < MIN_OBSERVATIONS:
+        return None
+    change = found.colours[one[i]] - found.colours[other[j]]
+    # The same exposure and white balance; the variance of a difference is that of both views.
+    change = change - np.median(change, axis=0)
+    return float(np.median(np.abs(change))) * TO_DEVIATION / np.sqrt(2)
 
 
 def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int64]]:

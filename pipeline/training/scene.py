@@ -113,7 +113,7 @@ def train_scene(
             inputs.views, scene.model, initial.means.double().numpy(), inputs.gains, size
         )
         # Gains are then a part of the appearance (``Appearance.gains``).
-        inputs, gains = replace(inputs, embeddings=start), NO_GAINS
+        inputs, gains = replace(inputs, embeddings=start), appearance.shading
     trained = run_training(inputs, run, notes)
     result, refined = trained.result, scene.model
     if result.intrinsics is not None:

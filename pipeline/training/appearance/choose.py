@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.photos.disagreement import ColourDisagreement, colour_disagreement
 from pipeline.photos.exposure import observe, sample_views, solve_gains
 from pipeline.photos.shading import (
+    Light,
     Parts,
     choose_parts,
     fit_light,
@@ -27,9 +28,9 @@ from pipeline.scene.views import View
 # exposure it is 0 to 0.1, in collections from the internet 0.5.
 EXPOSURES_DIFFER = 0.2
 # Disagreement on colours (``colour_disagreement``) from which photographs are taken to be in
-# different light. Of one camera on one day it is up to 0.1, or 0.2 where points are inaccurate (a
-# street driven along); with another light, 0.6. In collections by many cameras it is 0.15 or more.
-COLOURS_DISAGREE, COLOURS_OF_COLLECTION_DISAGREE = 0.3, 0.13
+# different light. In one light it is .03 with accurate points and up to .11 with vignetting or an
+# automatic tone curve; in several lights, .15 or more.
+COLOURS_DISAGREE = 0.13
 # In a collection, photographs are taken to be in different light if fewer than this share of them
 # can be compared: those in one light have matches, and so common points.
 MEASURED_SHARE = 0.5
@@ -40,14 +41,16 @@ class AppearanceChoice:
     """How the colours of photographs differ.
 
     Attributes:
-        gains: The exposure gains of all views, with embeddings of the training views alone; empty
-            if exposure is not modelled.
+        gains: The light of all views; with embeddings of the training views alone. Empty if it is
+            not modelled.
+        shading: With embeddings, the light of all views without gains; empty if there is none.
         embeddings: Whether views have appearance embeddings.
         decisions: The sentences for the user.
         counters: The measured values by the names of their counters.
     """
 
     gains: ExposureGains = NO_GAINS
+    shading: ExposureGains = NO_GAINS
     embeddings: bool = False
     decisions: list[str] = field(default_factory=list)
     counters: dict[str, float] = field(default_factory=dict)
@@ -76,7 +79,7 @@ def choose_appearance(
     choice = AppearanceChoice(embeddings=wanted == "embedding")
     training = [view for view in views if not view.is_test]
     if choice.embeddings and not has_alpha:
-        choice.gains = _gains_besides_embeddings(training, model)
+        _choose_light_besides_embeddings(choice, views, model, cameras)
     if wanted in ("none", "embedding") or has_alpha:
         return choice
     collection = is_collection(list(cameras.values()))
@@ -96,7 +99,7 @@ def choose_appearance(
                 "colours, which are exported, are those of the mean embedding and of the typical "
                 "exposure"
             )
-            choice.gains = _gains_besides_embeddings(training, model)
+            _choose_light_besides_embeddings(choice, views, model, cameras)
             return choice
     _choose_light(choice, views, model, wanted, cameras)
     return choice
@@ -136,12 +139,7 @@ def _choose_light(
             "far as parts of each image agree"
         )
     if parts.vignetting:
-        choice.counters["vignetting_stops"] = round(light.vignetting_stops, 4)
-        choice.decisions.append(
-            f"corners are darker than the centre of the image, by up to "
-            f"{light.vignetting_stops:.2f} stops: renders are multiplied by the vignetting of each "
-            "camera"
-        )
+        _describe_vignetting(choice, light)
     if parts.slopes:
         choice.counters["slope_stops"] = round(light.slope_stops, 4)
         choice.decisions.append(
@@ -163,16 +161,47 @@ def _reason_for_embeddings(found: ColourDisagreement, collection: bool) -> str |
             "photographs by many cameras see too few common points to compare their light "
             f"({found.measured:.0%} of them see enough)"
         )
-    if found.value > (COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE):
+    if found.value > COLOURS_DISAGREE:
         return f"photographs disagree on colours after exposure (by {found.value:.2f} in log2)"
     return None
 
 
-def _gains_besides_embeddings(training: Sequence[View], model: Reconstruction) -> ExposureGains:
-    """The gains of the training views. Those of other views are fitted with their embeddings
-    (``appearance.fit``): measured ones would show what the measured half of the photograph is."""
-    seen = observe(training, model)
-    return _by_name(training, fit_light(seen, Parts()).of_views(seen))
+def _choose_light_besides_embeddings(
+    choice: AppearanceChoice,
+    views: Sequence[View],
+    model: Reconstruction,
+    cameras: Mapping[str, str],
+) -> None:
+    """Add the gains of the training views to ``choice``, and the vignetting of the cameras if there
+    is evidence of it. Gains of other views are fitted with their embeddings (``appearance.fit``):
+    measured ones would show what the measured half of the photograph is."""
+    training = [view for view in views if not view.is_test]
+    parts = choose_parts(observe(sample_views(training), model, cameras))
+    seen = observe(training, model, cameras)
+    light = fit_light(seen, Parts(vignetting=parts.vignetting))
+    choice.gains = _by_name(training, light.of_views(seen))
+    if parts.vignetting:
+        of_camera = {
+            (view.camera_id, cameras.get(view.name, "")): of_view.vignetting
+            for view, of_view in zip(training, light.of_views(seen), strict=True)
+        }
+        _describe_vignetting(choice, light)
+        lights = [
+            ViewLight(
+                gain=(1.0, 1.0, 1.0),
+                vignetting=of_camera.get((view.camera_id, cameras.get(view.name, "")), (0.0, 0.0)),
+            )
+            for view in views
+        ]
+        choice.shading = _by_name(views, lights)
+
+
+def _describe_vignetting(choice: AppearanceChoice, light: Light) -> None:
+    choice.counters["vignetting_stops"] = round(light.vignetting_stops, 4)
+    choice.decisions.append(
+        f"corners are darker than the centre of the image, by up to {light.vignetting_stops:.2f} "
+        "stops: renders are multiplied by the vignetting of each camera"
+    )
 
 
 def _by_name(views: Sequence[View], light: Sequence[ViewLight]) -> ExposureGains:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.render import Backend, RasterOptions, make_backend
 from pipeline.render.views import limit_sh_degree, raster_camera
 from pipeline.scene.appearance import Appearance, fitted_columns
+from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.appearance.embedding import with_appearance
@@ -36,6 +37,7 @@ def in_photograph(
     photo: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None,
     options: RasterOptions,
+    light: ViewLight | None = None,
     backend: Backend | None = None,
 ) -> Gaussians:
     """The Gaussians in the colours of a photograph. The embedding of a photograph that is not a
@@ -43,7 +45,9 @@ def in_photograph(
 
     Args:
         gaussians: The Gaussians of the scene.
-        photo, mask: See ``fit_embedding``; the mask is False for ignored pixels.
+        photo: (H, W, 3) colours over the background of ``options``.
+        mask: (H, W), False for ignored pixels; None if there are none.
+        light: By which a render is multiplied before it is compared; None for nothing.
     """
     gaussians = replace(gaussians, appearance=torch.from_numpy(appearance.colors))
     embedding, gain = appearance.embeddings.get(view.name), appearance.gains.get(view.name)
@@ -51,18 +55,32 @@ def in_photograph(
         left = np.zeros(photo.shape[:2], bool)
         left[:, : fitted_columns(photo.shape[1])] = True
         pixels = left if mask is None else left & mask
-        embedding, gain = fit_appearance(
-            gaussians, appearance, view, photo, pixels, options, backend
-        )
+        factor = None if light is None else light.factor(view)
+        target = Target(view, photo, pixels, factor)
+        embedding, gain = fit_appearance(gaussians, appearance, target, options, backend)
     return replace(with_appearance(gaussians, embedding, gain), appearance=None)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a render shall look like.
+
+    Attributes:
+        photo: (H, W, 3) colours over the background.
+        pixels: (H, W) bool, True for the pixels to fit.
+        factor: (3,) or (H, W, 3), by which the render is multiplied; None for 1.
+    """
+
+    view: View
+    photo: NDArray[np.uint8]
+    pixels: NDArray[np.bool_]
+    factor: NDArray[np.float32] | None = None
 
 
 def fit_appearance(
     gaussians: Gaussians,
     appearance: Appearance,
-    view: View,
-    photo: NDArray[np.uint8],
-    pixels: NDArray[np.bool_],
+    target: Target,
     options: RasterOptions,
     backend: Backend | None = None,
 ) -> tuple[Array, Array | None]:
@@ -71,13 +89,12 @@ def fit_appearance(
 
     Args:
         gaussians: The Gaussians with ``appearance``.
-        photo: (H, W, 3) colours over the background of ``options``.
-        pixels: (H, W) bool, True for the pixels to fit.
         backend: The backend of the rasterizer; None: the default.
     """
     backend = backend or make_backend()
     options = limit_sh_degree(options, gaussians)
-    camera, target = raster_camera(view), photo[pixels] / 255.0
+    camera, pixels = raster_camera(target.view), target.pixels
+    wanted, factor = target.photo[pixels] / 255.0, target.factor
     known = np.array(list(appearance.embeddings.values()))
     size = known.shape[1]
     # The unknowns are the embedding, and the logarithms of the gain.
@@ -94,7 +111,8 @@ def fit_appearance(
     def render(unknowns: Array) -> Array:
         shown = with_appearance(gaussians, unknowns[:size], gain_of(unknowns))
         color = backend.forward(*shown.parameters(), camera, options).color.numpy()
-        return color[pixels].astype(np.float64)
+        shaded = color if factor is None else color * factor
+        return shaded[pixels].astype(np.float64)
 
     unknowns = np.zeros(len(deviations))
     for _ in range(STEPS):
@@ -105,6 +123,6 @@ def fit_appearance(
         ]
         # Avoid matrix products: BLAS may round differently with the number of threads.
         normal = np.array([[np.sum(a * b) for b in slopes] for a in slopes])
-        right = np.array([np.sum(a * (target - now)) for a in slopes])
+        right = np.array([np.sum(a * (wanted - now)) for a in slopes])
         unknowns = unknowns + np.linalg.solve(normal + np.diag(prior), right - prior * unknowns)
     return unknowns[:size], gain_of(unknowns)

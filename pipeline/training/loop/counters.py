@@ -58,8 +58,8 @@ class TrainCounters(StageCounters):
     )
     colour_disagreement: float | None = Field(
         None,
-        description="Standard deviation of log2 of the colours of a point over the photographs, "
-        "after gains that compensate exposure; absent unless `train.appearance` is `measured`, for "
+        description="Standard deviation of log2 of the colours of a point in neighbouring "
+        "photographs, apart from exposure; absent unless `train.appearance` is `measured`, for "
         "photographs with alpha, and for blocks.",
     )
     changes: ChangeCounters = Field(

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.photos.disagreement import ColourDisagreement
+from pipeline.photos.exposure import GAMMA
 from pipeline.training.appearance import choose as choose_module
 from pipeline.training.appearance.choose import AppearanceChoice, choose_appearance
 from tests.photos.test_disagreement import photographs
+from tests.photos.test_shading import lit, observations
 
 ALIKE = np.ones((8, 3))
 EXPOSED = np.array([[0.7] * 3, [1.4] * 3] * 4)
@@ -66,18 +69,38 @@ def test_blocks_have_no_embeddings_and_alpha_no_gains(tmp_path: Path) -> None:
     assert not with_alpha.gains and not with_alpha.embeddings and not with_alpha.counters
 
 
-@pytest.mark.parametrize("cameras", [1, 8])
-def test_a_collection_by_many_cameras_needs_less_evidence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: int
+@pytest.mark.parametrize(("disagreement", "embeddings"), [(0.11, False), (0.16, True)])
+def test_embeddings_need_photographs_that_disagree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disagreement: float, embeddings: bool
 ) -> None:
-    """Where points are inaccurate, photographs of one camera disagree as well."""
-    monkeypatch.setattr(
-        choose_module, "colour_disagreement", lambda *_: ColourDisagreement(0.2, 1.0)
+    """Vignetting and inaccurate points make the photographs of one light disagree as well."""
+    found = ColourDisagreement(disagreement, 1.0)
+    monkeypatch.setattr(choose_module, "colour_disagreement", lambda *_: found)
+    assert choose(tmp_path, "measured", [0] * 8).embeddings == embeddings
+
+
+def test_vignetting_is_modelled_beside_embeddings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the vignetting of its camera for each view, and gains of the training views alone."""
+    seen = observations(lit(gains=0.5))
+    trained = len(seen.photo_of)
+    views, model, points = photographs(tmp_path, [0, 1] * (trained // 2), np.ones((trained, 3)))
+    cameras = {view.name: f"body {number % 2}" for number, view in enumerate(views)}
+    test = replace(views[1], name="test.png", is_test=True)
+    cameras[test.name] = "body 1"
+    monkeypatch.setattr(choose_module, "observe", lambda *_: seen)
+    all_views = [*views, test]
+    found = choose_appearance(
+        all_views, model, points, "embedding", cameras=cameras, has_alpha=False, in_blocks=False
     )
-    scene = photographs(tmp_path, [0] * 8, ALIKE)
-    groups = {view.name: f"{number % cameras}" for number, view in enumerate(scene[0])}
-    found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
-    assert found.embeddings == (cameras == 8)
+    assert found.gains.root.keys() == {view.name for view in views}
+    for number, view in enumerate(all_views):
+        light = found.shading.root[view.name]
+        assert light.gain == (1.0, 1.0, 1.0)
+        expected = -1 / GAMMA if view is test or number % 2 else 0.0
+        assert sum(light.vignetting) == pytest.approx(expected, abs=0.03)
+    assert "corners are darker" in "".join(found.decisions)
 
 
 @pytest.mark.parametrize("cameras", [1, 8])

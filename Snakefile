@@ -42,6 +42,7 @@ wildcard_constraints:
 
 
 localrules:
+    accept,
     all,
     benchmark,
     plan,
@@ -95,6 +96,21 @@ rule plan:
     shell:
         "python -m stages.workflow.plan --out {output.plan:q} --picture {output.picture:q}"
         " --plan {params.plan:q} --log {log:q}"
+
+
+# Whether a run's result is good enough. It fails, with the reasons, if it is not.
+rule accept:
+    input:
+        metrics="results/{scene}/metrics.json",
+    output:
+        accepted="results/{scene}/accepted.json",
+    log:
+        "results/{scene}/logs/accept.log",
+    params:
+        criteria=project.acceptance,
+    shell:
+        "python -m stages.workflow.accept --out {output.accepted:q}"
+        " --criteria {params.criteria:q} --log {log:q}"
 
 
 # One rule per stage: inputs, key and outputs follow from its declaration.

@@ -50,6 +50,20 @@ _KERNELS = ("tests/render/test_kernels.py",)
 _LOSS = ("tests/render/test_loss_adam.py",)
 
 MUTANTS: dict[str, Mutant] = {
+    "accepts_missing": Mutant(
+        "pipeline/reporting/acceptance/judge.py",
+        'f"not measured ({check.missing})", False',
+        'f"not measured ({check.missing})", True',
+        "a rule is met by a figure that was not measured",
+        ("tests/reporting/acceptance",),
+    ),
+    "other_split": Mutant(
+        "pipeline/reporting/acceptance/measured.py",
+        "if theirs != ours:",
+        "if False:",
+        "a baseline of another split or resolution is compared",
+        ("tests/reporting/acceptance",),
+    ),
     "half_gradient": Mutant(
         f"{_CSRC}/project_math.h",
         "d_cam.x * row(view.rotation, 0) + d_cam.y",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Split
+from pipeline.config.schema import Config, Split
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -19,12 +21,16 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
+    _criteria(settled.config)
     return StagePlan(run=True, reason="metrics.json and report.html")
 
 
 def work(job: Job) -> None:
+    from pipeline.coverage.record import CoverageRecord
     from pipeline.metrics.evaluation import Evaluation
     from pipeline.metrics.protocol import choose_protocol
+    from pipeline.reporting.acceptance.command import Criteria, badge
+    from pipeline.reporting.acceptance.measured import measured_of
     from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.data import TrainedScene
     from pipeline.reporting.headline import headline
@@ -54,16 +60,38 @@ def work(job: Job) -> None:
         near=protocol.near,
         normalization=Georeference.normalization_of(job.inputs["poses"]),
     )
+    timed = with_times(metrics, runs)
+    judgement = None
+    if (criteria := job.key["acceptance"]) is not None:
+        measured = measured_of(timed, CoverageRecord.read(job.inputs["coverage"]))
+        judgement = badge(Criteria.model_validate(criteria), measured)
     data = read_results(
         job.inputs,
-        with_times(metrics, runs),
+        timed,
         plan,
         trained,
         inputs.trained_model(job).points,
         shown=job.section(Experiments).report.views,
     )
-    write_report(data, job.out / "report.html")
+    write_report(replace(data, judgement=judgement), job.out / "report.html")
     job.decide(headline(metrics))
+
+
+def _criteria(config: Config) -> dict[str, Any] | None:
+    """The rules that the page judges the result by, with their baseline.
+
+    Raises:
+        UserError: They cannot be read.
+    """
+    if config.acceptance is None:
+        return None
+    from pipeline.reporting.acceptance.command import read_criteria
+
+    return read_criteria(Path(config.acceptance)).model_dump(mode="json")
+
+
+def facts(plan: Plan) -> dict[str, Any]:
+    return {"acceptance": _criteria(plan.config)}
 
 
 SPEC = StageSpec(
@@ -81,4 +109,5 @@ SPEC = StageSpec(
         "report.html": "pipeline/reporting/captions/page.rst",
     },
     shows_plan=True,
+    facts=facts,
 )

@@ -23,7 +23,7 @@ from tests.e2e.harness import ROOT
 
 COMMANDS = list(dict.fromkeys(commands()))
 TARGETS = re.compile(
-    r"results/(benchmark\.(csv|json)|[^/]+/(metrics\.json|plan\.json|report\.html))"
+    r"results/(benchmark\.(csv|json)|[^/]+/(accepted\.json|metrics\.json|plan\.json|report\.html))"
 )
 
 

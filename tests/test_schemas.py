@@ -12,6 +12,9 @@ import pytest
 from pipeline.config import docs
 from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.plan.given_poses import GivenModel
+from pipeline.reporting.acceptance.judge import judge
+from pipeline.reporting.acceptance.measured import measured_of
+from pipeline.reporting.acceptance.rules import Rules
 from pipeline.runtime.json_file import JsonFile
 from pipeline.scene.georeference import GeographicOrigin, Georeference, Residual
 from pipeline.scene.normalization import Normalization
@@ -19,7 +22,7 @@ from pipeline.scene.reconstruction import Reconstruction
 from pipeline.sfm.georeference import summary
 from pipeline.surface.path import describe_path
 from tests.metrics.test_evaluation import ERROR
-from tests.reporting.made import coverage, evaluation, gaussians, ring
+from tests.reporting.made import coverage, evaluation, gaussians, metrics, ring
 from tests.reporting.test_page import NO_SURFACE
 
 GIVEN = GivenModel(
@@ -44,6 +47,7 @@ RENDER = RenderSettings(background=(0.0, 0.0, 0.0), near=0.01, antialias=True)
 FILES: list[JsonFile] = [
     evaluation(),
     evaluation().model_copy(update={"pose_error": ERROR}),
+    judge(Rules(), measured_of(metrics(), coverage().record)),
     coverage().record,
     NO_SURFACE,
     GPS,

@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from pipeline.command import parser as types
 from pipeline.command.parser import Parser
 from pipeline.command.workflow import add_workflow_commands
-from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.errors import (
+    EXIT_INTERRUPTED,
+    EXIT_NOT_ACCEPTED,
+    EXIT_USER_ERROR,
+    UserError,
+    as_user_error,
+)
 from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.suggest import check_exists
@@ -128,6 +134,13 @@ def make_parser(program: str = "splatmake") -> Parser:
     about = "PSNR, SSIM and FLIP of each test view against its photograph, and their means."
     example = "point_cloud.ply --scene results/garden"
     _add_evaluate(command("evaluate", _evaluate, text, example, about))
+    text = "say whether a result meets rules, for CI"
+    about = (
+        "Judge a finished scene by rules, and say for each what is wanted and found. The exit code "
+        "is 0 if all are met, 1 if not, 2 after an error."
+    )
+    example = "results/garden --rules config/acceptance.yaml"
+    _add_accept(command("accept", _accept, text, example, about))
     text = "tables of a batch, or of two"
     about = (
         "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
@@ -300,6 +313,26 @@ def _publish(**options: Any) -> None:
     from pipeline.reporting.publish import publish
 
     _print(publish(**options))
+
+
+def _add_accept(add: Callable[..., object]) -> None:
+    add("scene", type=Path, metavar="SCENE", help="finished scene: results/NAME")
+    text = "rules in YAML (default: those of docs/reference/acceptance.md)"
+    add("--rules", type=Path, metavar="FILE", help=text)
+    text = "accepted.json, results/NAME or metrics.json to compare with (default: the rules')"
+    add("--baseline", type=Path, metavar="PATH", help=text)
+    text = "write the judgement to this file, a baseline of later ones"
+    add("--json", dest="target", type=Path, metavar="FILE", help=text)
+
+
+def _accept(scene: Path, rules: Path | None, **options: Any) -> int:
+    from pipeline.reporting.acceptance.command import accept
+
+    if rules is None:
+        print("the default rules apply; --rules names a file of others")
+    judged, lines = accept(scene, rules, **options)
+    _print(lines)
+    return 0 if judged.accepted else EXIT_NOT_ACCEPTED
 
 
 def _add_compare(add: Callable[..., object]) -> None:

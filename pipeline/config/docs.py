@@ -36,6 +36,7 @@ _RECORDS = {
     "run.json": "pipeline.runtime.record:RunRecord",
     "images.json": "pipeline.scene.manifest:Manifest",
     "metrics.json": "pipeline.reporting.metrics:Metrics",
+    "accepted.json": "pipeline.reporting.acceptance.judge:Acceptance",
     "plan.json": "pipeline.plan.record:PlanRecord",
     "evaluation.json": "pipeline.metrics.evaluation:Evaluation",
     "coverage.json": "pipeline.coverage.record:CoverageRecord",
@@ -98,7 +99,7 @@ most of them.
 
 def page() -> str:
     """The Markdown of the page of the product's options."""
-    lines = [_INTRO, "## Top level", "", *_table((Project,))]
+    lines = [_INTRO, "## Top level", "", *table((Project,))]
     for name, field in Project.model_fields.items():
         if sections_of(field) and name != "experiments":
             lines += _section_page(name, sections_of(field))
@@ -146,7 +147,7 @@ def fields_of(sections: Sequence[type[BaseModel]]) -> dict[str, list[FieldInfo]]
 
 
 def _section_page(path: str, sections: Sequence[type[BaseModel]]) -> list[str]:
-    lines = [f"## {path}", "", _about(sections), "", *_table(sections)]
+    lines = [f"## {path}", "", _about(sections), "", *table(sections)]
     for name, fields in fields_of(sections).items():
         if inner := sections_of(fields[0]):
             lines += _section_page(f"{path}.{name}", inner)
@@ -161,7 +162,8 @@ def _about(sections: Sequence[type[BaseModel]]) -> str:
     return "\n".join(f"- `{section.__name__.lower()}`: {about}" for section, about in named)
 
 
-def _table(sections: Sequence[type[BaseModel]]) -> list[str]:
+def table(sections: Sequence[type[BaseModel]]) -> list[str]:
+    """A table of options as lines of Markdown; empty without options."""
     rows = ["| option | values | unit | default | meaning |", "|---|---|---|---|---|"]
     for name, fields in fields_of(sections).items():
         if not sections_of(fields[0]):

@@ -432,6 +432,12 @@ class Config(Section):
         "estimated.",
     )
     seed: Seed = Field(0, description="Seed of all random numbers.")
+    acceptance: FilePath | None = Field(
+        None,
+        description="File of rules (YAML, relative to the folder that holds results/) by which the "
+        "page judges the result; see `splatmake accept`.",
+        json_schema_extra={"decides_result": False},
+    )
     inspect: Inspect = Field(default_factory=Inspect)
     views: Views = Field(default_factory=Views)
     split: Split = Field(default_factory=Split)

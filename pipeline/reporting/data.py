@@ -145,6 +145,7 @@ class SceneResults:
         holes: What was invented; None without.
         photographs: The photograph's name for each view that has another name.
         downloads: The exported files.
+        judgement: Whether the result meets the rules of acceptance, in a line; None without rules.
     """
 
     metrics: TimedMetrics
@@ -159,6 +160,7 @@ class SceneResults:
     holes: HolesSection | None = None
     photographs: Mapping[str, str] = field(default_factory=dict)
     downloads: Sequence[Download] = ()
+    judgement: str | None = None
 
 
 def ranked(per_view: Sequence[ViewMetrics], count: int) -> list[tuple[Rank, ViewMetrics]]:

@@ -8,6 +8,8 @@ from pathlib import Path
 from pipeline.runtime.text import without_middle
 
 EXIT_USER_ERROR = 2
+EXIT_NOT_ACCEPTED = 1
+"""A result does not meet the rules of ``splatmake accept``."""
 # The largest numbers of characters of a line, and of the parts of a message.
 _MAX_LINE = 600
 _MAX_WHAT, _MAX_FILE, _MAX_FIX = 1150, 280, 450

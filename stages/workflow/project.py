@@ -23,6 +23,7 @@ from pipeline.plan.settle import PROCESSOR, Choice
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
 from pipeline.render.devices import check_device, choose_device
+from pipeline.reporting.acceptance.command import read_criteria
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.reporting.headline import batch_lines
 from pipeline.runtime.atomic import write_json
@@ -257,6 +258,12 @@ class SnakemakeProject:
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
         return canonical(plan_record(self._plan(wildcards.scene)).model_dump(mode="json"))
+
+    def acceptance(self, wildcards: Any) -> str:
+        """Params function: the rules for the run's result, as canonical JSON."""
+        chosen = self._plan(wildcards.scene).config.acceptance
+        criteria = read_criteria(None if chosen is None else Path(chosen))
+        return canonical(criteria.model_dump(mode="json"))
 
     def _inputs(self, spec: StageSpec, name: str) -> dict[str, Path]:
         return _sources(spec, self._plan(name), name)

@@ -78,4 +78,10 @@ def _similar(target: PurePath, scenes: Sequence[str]) -> str | None:
 def _files() -> list[str]:
     """The files of a scene's results that can be requested."""
     published = [file for spec in STAGES.values() for file in spec.publishes]
-    return [*published, "plan.json", "plan.svg", *(f"{name}/stage.json" for name in STAGES)]
+    return [
+        *published,
+        "accepted.json",
+        "plan.json",
+        "plan.svg",
+        *(f"{name}/stage.json" for name in STAGES),
+    ]

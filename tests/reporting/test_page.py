@@ -305,3 +305,14 @@ def test_blocks_are_on_their_map_and_in_their_table() -> None:
     cameras = [attrs for _, attrs in page.tags if attrs.get("class") == "camera"]
     assert len(cameras) == sum(not view.is_test for view in ring())
     assert "1,234 21.50 dB 1 min 1 s 345 MB" in page.all_text()
+
+
+@pytest.mark.parametrize("judgement", [None, "accepted", "not accepted: PSNR 24 dB <b>, 26 wanted"])
+def test_the_page_shows_the_judgement_if_there_are_rules(judgement: str | None) -> None:
+    text = report_html(report(judgement=judgement))
+    shown = re.findall(r'<span class="judgement (\w+)">(.*?)</span>', text)
+    expected = {
+        None: [],
+        "accepted": [("good", "Accepted")],
+    }.get(judgement, [("weak", "Not accepted: PSNR 24 dB &lt;b&gt;, 26 wanted")])
+    assert shown == expected

@@ -12,7 +12,7 @@ from pipeline.splats.gaussians import Gaussians
 
 
 def read_gaussians(file: str | PathLike[str]) -> Gaussians:
-    """Read Gaussians from a .ply, .spz, .splat, .glb or .npz file.
+    """Read Gaussians from a .ply, .spz, .sog, .splat, .glb or .npz file.
 
     Raises:
         UserError: The suffix is unknown, or the file cannot be read.

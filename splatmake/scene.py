@@ -151,7 +151,8 @@ class Scene:
         min_opacity: float = 0.0,
         morton_order: bool = True,
     ) -> None:
-        """Write the Gaussians in the format of the file's suffix: .ply, .spz, .splat, .glb or .npz.
+        """Write the Gaussians in the format of the file's suffix: .ply, .spz, .sog,
+        .splat, .glb or .npz.
 
         With the default options, a file is the same as that of the export stage. Coordinates are in
         the unit of given poses, in .npz files in that of ``gaussians``. A warning names what the

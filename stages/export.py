@@ -1,9 +1,10 @@
 """Files for other programs.
 
-Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.splat``, ``.glb``); sparse points
-(``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP; ``transforms.json``);
-``frame.json`` with axes, unit and up direction. On demand ``dense_points.ply``, ``dense_maps/``,
-``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
+Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``.splat``, ``.glb``);
+sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP;
+``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
+``dense_points.ply``, ``dense_maps/``, ``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and
+``.glb``, ``video`` and ``path.json``.
 """
 
 from __future__ import annotations

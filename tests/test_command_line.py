@@ -113,12 +113,12 @@ def test_a_model_of_degree_0_is_measured_and_converted(folder):
     photograph(folder / "scene", blobs(0))
     found = measured(folder / "flat.ply", folder / "scene")
     assert found["psnr"] == 100 and found["model"]["sh_degree"] == 0
-    for suffix in (".spz", ".glb", ".npz"):
+    for suffix in (".spz", ".sog", ".glb", ".npz"):
         assert run("convert", folder / "flat.ply", folder / f"flat{suffix}") == 0
         assert measured(folder / f"flat{suffix}", folder / "scene")["psnr"] > 45
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".glb", ".npz"])
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".npz"])
 def test_a_converted_model_looks_the_same(folder, suffix):
     target = folder / f"model{suffix}"
     assert run("convert", folder / "model.ply", target, "--morton-order") == 0

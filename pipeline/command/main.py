@@ -29,7 +29,7 @@ from pipeline.runtime.suggest import check_exists
 if TYPE_CHECKING:
     from pipeline.commands import Rendering
 
-MODEL = "file of Gaussians (.ply, .spz, .splat, .glb, or .npz of the results)"
+MODEL = "file of Gaussians (.ply, .spz, .sog, .splat, .glb, or .npz of the results)"
 # The commands that pass further options to Snakemake.
 WORKFLOW_COMMANDS = ("run", "plan", "batch")
 # The arguments that are existing files or folders.

@@ -369,6 +369,7 @@ ExportFormat = Literal[
     "blocks",
     "spz",
     "spz4",
+    "sog",
     "splat",
     "gltf",
     "points",
@@ -401,8 +402,9 @@ class Export(Section):
         ("ply", "spz", "points", "colmap", "transforms"),
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
         "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
-        "read, for up to 30 million Gaussians instead of 10), splat (without SH), gltf (.glb with "
-        "KHR_gaussian_splatting). points: coloured sparse points. "
+        "read, for up to 30 million Gaussians instead of 10), sog (PlayCanvas's format, about a "
+        "seventh of the size), splat (without SH), gltf (.glb with KHR_gaussian_splatting). "
+        "points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
         "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "

@@ -17,6 +17,7 @@ from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
+from pipeline.io.sog import write_sog
 from pipeline.io.splat import write_splat
 from pipeline.io.splat_losses import losses, unmarked
 from pipeline.io.spz import write_spz
@@ -37,7 +38,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
 # The formats of one file with the Gaussians.
-GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "splat", "gltf")
+GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "sog", "splat", "gltf")
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,9 @@ class _Files:
     def write_spz(self, path: Path, version: int) -> None:
         write_spz(path, self.gaussians, antialias=self.antialias, version=version)
 
+    def write_sog(self, path: Path) -> None:
+        write_sog(path, self.gaussians, antialias=self.antialias)
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -174,6 +178,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
     "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
     "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),
+    "sog": ("point_cloud.sog", lambda path, f: f.write_sog(path)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),

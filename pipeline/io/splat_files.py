@@ -11,8 +11,9 @@ from pipeline.io.frame_json import Frame
 from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
 from pipeline.io.ply import read_splat_ply, write_splat_ply
+from pipeline.io.sog import is_antialiased_sog, read_sog, write_sog
 from pipeline.io.splat import read_splat, write_splat
-from pipeline.io.splat_losses import losses, losses_of_reading, unmarked
+from pipeline.io.splat_losses import losses, losses_of_reading, suffix_of_format, unmarked
 from pipeline.io.spz import read_antialias, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
@@ -23,6 +24,7 @@ _Format = tuple[Callable[[Path], Gaussians], Callable[[Path, GaussianSource], No
 _FORMATS: dict[str, _Format] = {
     ".ply": (read_splat_ply, write_splat_ply),
     ".spz": (read_spz, write_spz),
+    ".sog": (read_sog, write_sog),
     ".splat": (read_splat, write_splat),
     ".glb": (read_gltf, write_gltf),
     ".npz": (read_npz, write_npz),
@@ -98,6 +100,8 @@ def write_gaussians(
     _, write = _format_of(path)
     if write is write_spz:
         write_spz(path, gaussians, antialias=antialias, version=spz_version)
+    elif write is write_sog:
+        write_sog(path, gaussians, antialias=antialias)
     else:
         write(path, gaussians)
     return [*losses(path, gaussians), *(unmarked([path.name]) if antialias else [])]
@@ -106,8 +110,11 @@ def write_gaussians(
 def is_antialiased(path: Path) -> bool:
     """Whether a file of Gaussians, or the ``frame.json`` of the export that it belongs to, records
     that they were trained with Mip-Splatting's opacity compensation."""
-    if path.suffix.lower() == ".spz":
+    suffix = suffix_of_format(path)
+    if suffix == ".spz":
         return read_antialias(path)
+    if suffix == ".sog":
+        return is_antialiased_sog(path)
     # Another program's file of this name describes none of our exports.
     with contextlib.suppress(UserError, OSError):
         return is_exported(path) and Frame.read(path.parent).render.antialias
@@ -120,7 +127,7 @@ def check_suffix(path: Path) -> None:
 
 
 def _format_of(path: Path) -> _Format:
-    suffix = path.suffix.lower()
+    suffix = suffix_of_format(path)
     if suffix not in _FORMATS:
         raise UserError(
             f"expected a file of Gaussians ({', '.join(_FORMATS)}), found the suffix {suffix!r}",

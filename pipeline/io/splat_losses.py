@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.io.sog import count_small
+from pipeline.io.sog_container import META
 from pipeline.io.splat import share_of_clamped_colours
 from pipeline.io.spz import count_out_of_range, ignored_content, share_of_clamped_harmonics
 from pipeline.splats.arrays import GaussianSource
@@ -14,12 +16,18 @@ from pipeline.splats.arrays import GaussianSource
 TOLERATED_SHARE = 0.05
 
 
+def suffix_of_format(path: Path) -> str:
+    """The suffix that names the format of a file of Gaussians."""
+    # A folder of the files of a SOG archive is named by this file.
+    return ".sog" if path.name.lower() == META else path.suffix.lower()
+
+
 def losses(path: Path, gaussians: GaussianSource) -> list[str]:
     """A sentence for everything of the Gaussians that the file at ``path`` does not hold.
 
     The suffix of ``path`` names the format.
     """
-    suffix, found = path.suffix.lower(), []
+    suffix, found = suffix_of_format(path), []
     if suffix == ".spz":
         lost = count_out_of_range(gaussians)
         if lost > TOLERATED_SHARE * len(gaussians):
@@ -33,6 +41,14 @@ def losses(path: Path, gaussians: GaussianSource) -> list[str]:
             found.append(
                 f"{path.name}: {clamped:.0%} of the Gaussians have colours or spherical harmonics "
                 "outside of the range of SPZ, which are clamped. Use a PLY file to keep them"
+            )
+    if suffix == ".sog":
+        small = count_small(gaussians)
+        if small > TOLERATED_SHARE * len(gaussians):
+            found.append(
+                f"{path.name}: {small} of {len(gaussians)} Gaussians are smaller than half of a "
+                "step of SOG's positions, which have 16 bits over the scene. Use a PLY or SPZ file "
+                "to keep them apart"
             )
     if suffix == ".splat":
         clamped = share_of_clamped_colours(gaussians)
@@ -58,13 +74,13 @@ def losses_of_reading(path: Path) -> list[str]:
 
 def unmarked(files: Sequence[str]) -> list[str]:
     """The warning that ``files`` do not record the opacity compensation of the training; empty if
-    all of them are SPZ files, which record it."""
-    names = [name for name in files if Path(name).suffix.lower() != ".spz"]
+    all of them are SPZ or SOG files, which record it."""
+    names = [name for name in files if suffix_of_format(Path(name)) not in (".spz", ".sog")]
     if not names:
         return []
     return [
         f"{' and '.join(names)} cannot record that the Gaussians were trained with "
         "train.antialias, and viewers without Mip-Splatting's opacity compensation render them too "
-        "thick. Enable it in the viewer, use an SPZ file, which records it, or train with "
+        "thick. Enable it in the viewer, use an SPZ or SOG file, which record it, or train with "
         "train.antialias: false"
     ]

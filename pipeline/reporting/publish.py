@@ -23,6 +23,7 @@ _LABELS = {
     "point_cloud.ply": "Gaussians, for every program (PLY)",
     "point_cloud.spz": "Gaussians, compact (SPZ)",
     "point_cloud_v4.spz": "Gaussians, compact (SPZ 4)",
+    "point_cloud.sog": "Gaussians, compact, for PlayCanvas (SOG)",
     "point_cloud.splat": "Gaussians, for web viewers (.splat)",
     "point_cloud.glb": "Gaussians (glTF)",
     "mesh.glb": "Mesh with colours (glTF)",

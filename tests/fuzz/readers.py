@@ -265,6 +265,7 @@ READERS: dict[str, Reader] = {
     "ply-ascii": Reader(ascii_ply, read_any_gaussians),
     "spz": Reader(gaussian_seeds(".spz"), read_any_gaussians, gzip.decompress, pack_gzip),
     "spz-zstd": Reader(gaussian_seeds(".spz", 4), read_any_gaussians, unpack_spz, pack_spz),
+    "sog": Reader(gaussian_seeds(".sog"), read_any_gaussians, unpack_zip, pack_zip),
     "splat": Reader(gaussian_seeds(".splat"), read_any_gaussians),
     "glb": Reader(gaussian_seeds(".glb"), read_any_gaussians, unpack_glb, pack_glb),
     "npz": Reader(gaussian_seeds(".npz"), read_any_gaussians, unpack_zip, pack_zip),

@@ -18,6 +18,7 @@ from pipeline.io.splat_files import read_gaussians, write_gaussians
 from pipeline.io.spz import decode_spz, write_spz
 from pipeline.splats.axes import LUF, RUB
 from pipeline.splats.gaussians import Gaussians
+from tests.io.test_sog import OURS as SOG
 from tests.io.test_spz import OTHERS, axes_record, in_axes, with_extensions
 from tests.io.test_spz import OURS as SPZ
 from tests.splats.samples import EXACT, Within, sample
@@ -125,15 +126,21 @@ def test_niantics_library_agrees_on_the_axes_that_a_file_names(tmp_path) -> None
         replace(EXACT, opacity=0.004).check(gaussians, decode_spz(data))
 
 
-FILES = {"a.ply": (3, EXACT), "a.spz": (3, SPZ), "b.spz": (4, SPZ), "a.splat": (3, SPLAT)}
+FILES = {
+    "a.ply": (3, EXACT),
+    "a.spz": (3, SPZ),
+    "b.spz": (4, SPZ),
+    "a.sog": (3, SOG),
+    "a.splat": (3, SPLAT),
+}
 
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("degree", [0, 3])
 def test_splat_transform_reads_the_same_scene_from_our_files(tmp_path, name, degree) -> None:
     version, within = FILES[name]
-    write_gaussians(tmp_path / name, sample(300, degree), spz_version=version)
-    expected = sample(300, degree).with_sh_degree(0 if name == "a.splat" else degree)
+    write_gaussians(tmp_path / name, sample(256, degree), spz_version=version)
+    expected = sample(256, degree).with_sh_degree(0 if name == "a.splat" else degree)
     within.check(read_by_splat_transform(tmp_path / name), expected)
 
 
@@ -154,7 +161,18 @@ def test_the_same_scene_is_read_from_files_of_splat_transform(
     within.check(read_gaussians(tmp_path / name, []), sample(300))
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.spz"])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_sog_file_of_splat_transform_is_read_as_it_reads_it(tmp_path, degree) -> None:
+    """The file has another order, and a palette with fewer entries than Gaussians."""
+    write_gaussians(tmp_path / "a.ply", sample(300, degree))
+    splat_transform("-g", "cpu", tmp_path / "a.ply", tmp_path / "a.sog")
+    within = replace(EXACT, position=2e-6, log_scale=2e-6)
+    within.check(
+        read_gaussians(tmp_path / "a.sog", []), read_by_splat_transform(tmp_path / "a.sog")
+    )
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog"])
 def test_a_scene_is_upright_in_supersplat(tmp_path, name) -> None:
     """SuperSplat shows files in the space that splat-transform writes .glb files in: y up. The
     first Gaussian is below the others."""

@@ -173,7 +173,7 @@ def measure(setup: Setup, world: str, seed: int) -> LightResult:
         gaussians=len(gaussians),
         psnr=evaluation.psnr,
         psnr_right=float(np.mean(right)),
-        psnr_own=evaluation.psnr_without_gains or evaluation.psnr_without_fit or evaluation.psnr,
+        psnr_own=evaluation.psnr_without_fit or evaluation.psnr_without_gains or evaluation.psnr,
         psnr_withheld=float(np.mean(hidden)) if hidden else None,
         seconds=seconds,
     )

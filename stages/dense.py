@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import DENSE_FORMATS
+from pipeline.config.export import DENSE_FORMATS
 from pipeline.mvs.counters import DenseCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan

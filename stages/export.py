@@ -12,14 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import (
-    BLOCKS_FORMAT,
-    DENSE_FORMATS,
-    MASKS_FORMAT,
-    Export,
-    Split,
-    Views,
-)
+from pipeline.config.export import BLOCKS_FORMAT, DENSE_FORMATS, MASKS_FORMAT, Export
+from pipeline.config.schema import Split, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from pipeline.config.schema import RENDERED_FORMATS, ExportFormat
+from pipeline.config.export import RENDERED_FORMATS, ExportFormat
 from pipeline.config.settled import Config
 from pipeline.config.video import VideoExport
 from pipeline.export.counters import ExportCounters

@@ -134,13 +134,7 @@ def make_parser(program: str = "splatmake") -> Parser:
     about = "PSNR, SSIM and FLIP of each test view against its photograph, and their means."
     example = "point_cloud.ply --scene results/garden"
     _add_evaluate(command("evaluate", _evaluate, text, example, about))
-    text = "say whether a result meets rules, for CI"
-    about = (
-        "Judge a finished scene by rules, and say for each what is wanted and found. The exit code "
-        "is 0 if all are met, 1 if not, 2 after an error."
-    )
-    example = "results/garden --rules config/acceptance.yaml"
-    _add_accept(command("accept", _accept, text, example, about))
+    _add_accept(command)
     text = "tables of a batch, or of two"
     about = (
         "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
@@ -315,7 +309,14 @@ def _publish(**options: Any) -> None:
     _print(publish(**options))
 
 
-def _add_accept(add: Callable[..., object]) -> None:
+def _add_accept(command: Callable[..., Callable[..., object]]) -> None:
+    text = "say whether a result meets rules, for CI"
+    about = (
+        "Judge a finished scene by rules, and say for each what is wanted and found. The exit code "
+        "is 0 if all are met, 1 if not, 2 after an error."
+    )
+    example = "results/garden --rules config/acceptance.yaml"
+    add = command("accept", _accept, text, example, about)
     add("scene", type=Path, metavar="SCENE", help="finished scene: results/NAME")
     text = "rules in YAML (default: those of docs/reference/acceptance.md)"
     add("--rules", type=Path, metavar="FILE", help=text)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
-from pipeline.config.schema import Export, Split, Train
+from pipeline.config.export import Export
+from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters
 from pipeline.io.colmap import write_model
 from pipeline.io.depth_tiff import write_depth_tiff

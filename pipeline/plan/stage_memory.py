@@ -9,11 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from pipeline.config.schema import (
-    MAX_PHOTOS_WITH_MORE_FEATURES,
-    MORE_FEATURES,
-    RENDERED_FORMATS,
-)
+from pipeline.config.export import RENDERED_FORMATS
+from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size

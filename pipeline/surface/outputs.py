@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config.schema import Export
+from pipeline.config.export import Export
 from pipeline.config.video import VideoExport
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes

@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 
 import pipeline.surface.video as video
-from pipeline.config.schema import Export, Split, Train
+from pipeline.config.export import Export
+from pipeline.config.schema import Split, Train
 from pipeline.config.video import VideoExport
 from pipeline.io.videofile import read_video_facts
 from pipeline.metrics.protocol import choose_protocol

@@ -1,0 +1,70 @@
+"""Options of exported files."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from pipeline.config.section import Section, SHDegree, Unit
+from pipeline.config.video import VideoExport
+
+
+def _once(formats: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(formats))
+
+
+ExportFormat = Literal[
+    "ply",
+    "blocks",
+    "spz",
+    "spz4",
+    "sog",
+    "splat",
+    "gltf",
+    "points",
+    "colmap",
+    "colmap_text",
+    "transforms",
+    "dense_points",
+    "dense_maps",
+    "masks",
+    "renders",
+    "depths",
+    "mesh",
+    "video",
+]
+ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
+# The formats that need multi-view stereo.
+DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
+# The format that needs the blocks of the scene.
+BLOCKS_FORMAT: ExportFormat = "blocks"
+# The format that needs the photographs before undistortion.
+MASKS_FORMAT: ExportFormat = "masks"
+# The formats that need renders of the views.
+RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
+
+
+class Export(Section):
+    """Files for other programs."""
+
+    formats: ExportFormats = Field(
+        ("ply", "spz", "points", "colmap", "transforms"),
+        description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
+        "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
+        "read, for up to 30 million Gaussians instead of 10), sog (PlayCanvas's format, about a "
+        "seventh of the size), splat (without SH), gltf (.glb with KHR_gaussian_splatting). "
+        "points: coloured sparse points. "
+        "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
+        "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
+        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
+        "train.transients left out, as masks of the photographs (PNG). Rendered from every view: "
+        "renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera path).",
+    )
+    sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
+    mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(
+        None,
+        description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "
+        "would take over 24 million voxels.",
+    )
+    video: VideoExport = Field(default_factory=VideoExport)

@@ -57,6 +57,13 @@ MUTANTS: dict[str, Mutant] = {
         "a rule is met by a figure that was not measured",
         ("tests/reporting/acceptance",),
     ),
+    "prunes_most": Mutant(
+        "pipeline/export/selection.py",
+        "np.argsort(-weights,",
+        "np.argsort(weights,",
+        "the Gaussians that show least are kept",
+        ("tests/export",),
+    ),
     "other_split": Mutant(
         "pipeline/reporting/acceptance/measured.py",
         "if theirs != ours:",

@@ -11,8 +11,11 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from pydantic import TypeAdapter, ValidationError
 
 from pipeline.config.schema import Evaluate
+from pipeline.config.section import Box
+from pipeline.export.selection import Region, select_gaussians
 from pipeline.io.camera_files import choose_views, read_cameras
 from pipeline.io.photofile import MAX_PIXELS
 from pipeline.io.splat_files import (
@@ -33,7 +36,11 @@ from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View, camera_views, scene_extent
+from pipeline.splats.arrays import GaussianRows, collect
 from pipeline.splats.reduce import reduce_gaussians
+
+# Longer side of the views that decide which Gaussians are converted, pixels.
+_SELECTION_SIDE = 640
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,48 @@ class Rendering:
     threads: int
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """Which Gaussians of a file are converted.
+
+    Attributes:
+        max_gaussians: The largest number of them; None for all.
+        box: x0, y0, z0, x1, y1, z1 in the frame of the file; None for everything.
+        subject: Whether only what most cameras have in their images is converted.
+        cameras: The file that ``read_cameras`` reads; None without.
+    """
+
+    max_gaussians: int | None = None
+    box: Sequence[float] | None = None
+    subject: bool = False
+    cameras: Path | None = None
+
+    @property
+    def region(self) -> Region:
+        """The region for ``select_gaussians``.
+
+        Raises:
+            UserError: The corners are no box, there is a subject as well, or cameras that are
+                needed are missing.
+        """
+        for name in ("max_gaussians", "subject"):
+            if getattr(self, name) and self.cameras is None:
+                raise UserError(
+                    f"--{name.replace('_', '-')}: expected --cameras, which say what is seen",
+                    fix="add --cameras results/NAME, a COLMAP model or a transforms.json",
+                )
+        if self.subject and self.box is not None:
+            raise UserError("expected --box or --subject, found both", fix="leave one out")
+        if self.box is None:
+            return "subject" if self.subject else None
+        try:
+            return TypeAdapter(Box).validate_python(tuple(self.box))
+        except ValidationError as error:
+            what = error.errors()[0]["msg"].removeprefix("Value error, ")
+            fix = "give the lower corner first, in the unit of the file"
+            raise UserError(f"--box: {what}, found {list(self.box)}", fix=fix) from None
+
+
 def convert(
     source: Path,
     target: Path,
@@ -61,6 +110,7 @@ def convert(
     min_opacity: float,
     morton_order: bool,
     spz_version: int,
+    wanted: Wanted,
     warnings: list[str],
 ) -> list[str]:
     """Convert a file of Gaussians to the format of ``target``'s suffix.
@@ -68,6 +118,7 @@ def convert(
     Args:
         sh_degree, min_opacity, morton_order: The arguments of ``splats.reduce.reduce_gaussians``.
         spz_version: The version of an SPZ file that is written, 3 or 4.
+        wanted: Which Gaussians are converted.
         warnings: The list that warnings are added to, also of what ``target`` does not hold.
 
     Returns:
@@ -77,13 +128,31 @@ def convert(
         UserError: A file cannot be read or written.
     """
     check_suffix(target)
+    region = wanted.region
     found = read_gaussians(source, warnings)
-    made = reduce_gaussians(found.as_arrays(), sh_degree, min_opacity, morton_order)
-    antialias = is_antialiased(source)
+    arrays, antialias, said = found.as_arrays(), is_antialiased(source), []
+    if region is not None or (wanted.max_gaussians or len(found)) < len(found):
+        views = _selection_views(source, wanted.cameras)
+        options = RasterOptions(
+            antialias=bool(antialias), near=near_plane(scene_extent(views)) if views else 0.01
+        )
+        chosen = select_gaussians(arrays, wanted.max_gaussians, region, views, options)
+        arrays = collect(GaussianRows(arrays, chosen.rows, arrays.sh_degree))
+        said = [f"{source}: {text}" for text in chosen.decisions]
+    made = reduce_gaussians(arrays, sh_degree, min_opacity, morton_order)
     warnings += write_gaussians(target, made, antialias=antialias, spz_version=spz_version)
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"
-    return [f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]
+    return [f"{source}: {before}", *said, f"{target}: {len(made)} written, {size:.1f} MB"]
+
+
+def _selection_views(model: Path, cameras: Path | None) -> list[View]:
+    """The views that decide which Gaussians are converted, of a moderate size."""
+    if cameras is None:
+        return []
+    views = camera_views(read_cameras(cameras, exported=is_exported(model)), _SELECTION_SIDE)
+    _check_views(views, cameras)
+    return views
 
 
 def render(

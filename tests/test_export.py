@@ -307,3 +307,18 @@ def test_masks_that_training_did_not_find_are_no_files(scene):
 def test_pruning_everything_is_an_error(scene):
     with pytest.raises(UserError, match="have an opacity below"):
         export(scene, min_opacity=1.0)
+
+
+def test_a_region_and_a_limit_hold_for_every_file(scene):
+    """The box is in the unit of the exported files, and the cost is recorded."""
+    means = sample(50).means.numpy()
+    low, high = means.min(0), means.max(0)
+    middle = float(np.median(means[:, 0]))
+    box = [float(low[0]) - 1, *(low[1:] - 1).tolist(), middle, *(high[1:] + 1).tolist()]
+    out, job = export(scene, formats=["ply", "spz"], region=box, max_gaussians=12)
+    exported = read_gaussians(out / "point_cloud.ply", [])
+    assert len(exported) == 12 == len(read_gaussians(out / "point_cloud.spz", []))
+    assert exported.means[:, 0].max() <= middle
+    assert job.counters.exported_gaussians == 12 and job.counters.psnr_against_all is not None
+    assert json.loads((out / "frame.json").read_text())["gaussians"]["count"] == 12
+    assert any("12 Gaussians of 25" in text for text in job.decisions)

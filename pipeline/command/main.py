@@ -173,6 +173,15 @@ def _add_convert(add: Callable[..., object]) -> None:
     add("--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)")
     text = "remove Gaussians with a lower opacity, 0 to 1 (default 0)"
     add("--min-opacity", type=types.share, default=0.0, metavar="SHARE", help=text)
+    text = "keep this many, those that show most of the views; needs --cameras"
+    add("--max-gaussians", type=types.gaussians, metavar="N", help=text)
+    text = "keep what lies in a box, in the frame and unit of MODEL"
+    corners = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")
+    add("--box", type=float, nargs=6, metavar=corners, help=text)
+    text = "keep what most cameras have in their images; needs --cameras"
+    add("--subject", action="store_true", help=text)
+    text = "as for render; the cost of what is left out is measured on these views"
+    add("--cameras", type=Path, metavar="PATH", help=text)
     text = "sort along a Z-order curve: smaller files"
     add("--morton-order", action="store_true", help=text)
     text = "version of an .spz file (default 3, which more programs read)"
@@ -180,10 +189,12 @@ def _add_convert(add: Callable[..., object]) -> None:
 
 
 def _convert(**options: Any) -> None:
-    from pipeline.commands import convert
+    from pipeline.commands import Wanted, convert
 
     warnings: list[str] = []
-    _print(convert(**options, warnings=warnings), warnings)
+    names = ("max_gaussians", "box", "subject", "cameras")
+    wanted = Wanted(**{name: options.pop(name) for name in names})
+    _print(convert(**options, wanted=wanted, warnings=warnings), warnings)
 
 
 def _add_render(add: Callable[..., object]) -> None:

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pipeline.config.section import MAX_GAUSSIANS
 from pipeline.render.registry import DEVICE
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.suggest import did_you_mean, nearest
@@ -99,6 +100,10 @@ def positive(text: str) -> int:
     return _whole_number(text, (0,), "a positive whole number")
 
 
+def gaussians(text: str) -> int:
+    return _whole_number(text, (0,), "a positive whole number", MAX_GAUSSIANS)
+
+
 def cores(text: str) -> str:
     return text if text == "all" else str(_whole_number(text, (0,), "a number of cores or all"))
 
@@ -126,9 +131,11 @@ def entry(text: str) -> str:
     return text
 
 
-def _whole_number(text: str, refused: tuple[int, ...], expected: str) -> int:
+def _whole_number(
+    text: str, refused: tuple[int, ...], expected: str, largest: int = _MAX_NUMBER
+) -> int:
     number = int(text) if text.isdecimal() and len(text) <= 10 else -1
-    if not 0 <= number <= _MAX_NUMBER or number in refused:
-        expected += f", at most {_MAX_NUMBER}" if number > _MAX_NUMBER else ""
+    if not 0 <= number <= largest or number in refused:
+        expected += f", at most {largest}" if number > largest else ""
         raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:40]!r}")
     return number

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from pipeline.config.section import Section, SHDegree, Unit
+from pipeline.config.section import Box, GaussianCount, Section, SHDegree, Unit
 from pipeline.config.video import VideoExport
 
 
@@ -62,6 +62,17 @@ class Export(Section):
         "renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera path).",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
+    max_gaussians: GaussianCount | None = Field(
+        None,
+        description="The largest number of exported Gaussians: those that show most of the "
+        "training views, by the sum of alpha times transmittance. null: all.",
+    )
+    region: Literal["subject"] | Box | None = Field(
+        None,
+        description="Export only what lies in a box, [x0, y0, z0, x1, y1, z1] in the frame and "
+        "unit of the exported Gaussians, without the skybox. subject: a box around what most "
+        "cameras have in their images. null: everything.",
+    )
     mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(
         None,
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "

@@ -73,4 +73,21 @@ Share = Annotated[float, Field(ge=0.0, le=1.0), Unit("share")]
 LossWeight = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("factor")]
 LearningRate = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("per step")]
 SceneShare = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("scene sizes")]
+#: The largest coordinate of a box.
+MAX_COORDINATE = 1e9
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE), Unit("scene units")]
+
+
+def _with_inside(box: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise ValueError("Input should be [x0, y0, z0, x1, y1, z1] with x0 < x1, y0 < y1, z0 < z1")
+    return box
+
+
+#: Two corners of a box with sides along the axes: x0, y0, z0, x1, y1, z1.
+Box = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate],
+    AfterValidator(_with_inside),
+    Unit("scene units"),
+]
 FilePath = Annotated[str, AfterValidator(_plain_path)]

@@ -14,8 +14,17 @@ class ExportCounters(StageCounters):
     exported_gaussians: int = Field(
         ge=0,
         description="Number of Gaussians in each exported file, after "
-        "`experiments.export.min_opacity`.",
+        "`export.region`, `export.max_gaussians` and `experiments.export.min_opacity`.",
+    )
+
+    psnr_against_all: float | None = Field(
+        None,
+        description="Mean PSNR, dB, of renders of the test views with the Gaussians that "
+        "`export.max_gaussians` and `export.region` leave, against renders with all, over the "
+        "pixels that show the region; null where nothing was left out.",
     )
 
     def headline(self) -> str:
-        return counted(self.exported_gaussians, "Gaussian")
+        cost = self.psnr_against_all
+        against = "" if cost is None else f", PSNR {cost:.2f} dB against all"
+        return f"{counted(self.exported_gaussians, 'Gaussian')}{against}"

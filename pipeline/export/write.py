@@ -13,6 +13,7 @@ from pipeline.config.experiments import ExportExperiments
 from pipeline.config.export import Export
 from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters
+from pipeline.export.selection import Selection, select_gaussians
 from pipeline.io.colmap import write_model
 from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.io.frame_json import RenderSettings, describe_frame
@@ -34,7 +35,7 @@ from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.unrounded import Unrounded
 from pipeline.scene.views import View, scene_up
-from pipeline.splats.arrays import GaussianArrays, GaussianRows
+from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
@@ -212,6 +213,8 @@ def export_scene(
     views = [replace(view, world_to_camera=poses[view.name]) for view in scene.views]
     means = scene.gaussians.means
     normalization, scene = scene.normalization, _in_given_unit(scene)
+    scene, selection = _selected(scene, config, train, split, threads)
+    means = means[selection.rows]
     gaussians = reduce_gaussians(
         scene.gaussians,
         config.sh_degree,
@@ -231,7 +234,9 @@ def export_scene(
         if (out / file).exists():
             written.append(file)
     report = ExportReport(
-        ExportCounters(exported_gaussians=len(gaussians)), warnings=_warnings(files, config)
+        ExportCounters(exported_gaussians=len(gaussians), psnr_against_all=selection.psnr),
+        selection.decisions,
+        _warnings(files, config),
     )
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")
@@ -239,6 +244,22 @@ def export_scene(
     if not set(config.formats) <= WRITERS.keys():
         _write_rendered_formats(out, scene, config, train, split, threads, report)
     return report
+
+
+def _selected(
+    scene: ExportScene, config: Export, train: Train, split: Split, threads: int
+) -> tuple[ExportScene, Selection]:
+    """The scene with the Gaussians that ``export.region`` and ``export.max_gaussians`` leave."""
+    views, count = scene.training_size_views, len(scene.gaussians)
+    if config.region is None and (config.max_gaussians or count) >= count:
+        return scene, Selection(np.arange(count))
+    options = choose_protocol(views, split, train).options(train, threads)
+    found = select_gaussians(
+        scene.gaussians, config.max_gaussians, config.region, views, options, scene.num_invented
+    )
+    kept = collect(GaussianRows(scene.gaussians, found.rows, scene.gaussians.sh_degree))
+    invented = int((found.rows >= count - scene.num_invented).sum())
+    return replace(scene, gaussians=kept, num_invented=invented), found
 
 
 def _blocks_of(means: NDArray[np.float32], partition: Partition | None) -> NDArray[np.intp]:

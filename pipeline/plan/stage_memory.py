@@ -242,10 +242,13 @@ def _holes(plan: Plan, threads: int) -> float:
 
 def _export(plan: Plan, threads: int) -> float:
     written = _NUMPY + _MODEL_WRITTEN * _photos(plan) + _HELD * _gaussians(plan)
-    rendered = RENDERED_FORMATS.intersection(plan.config.export.formats)
-    if not rendered:
+    export = plan.config.export
+    rendered = RENDERED_FORMATS.intersection(export.formats)
+    selected = export.max_gaussians is not None or export.region is not None
+    if not rendered and not selected:
         return written
-    return max(written, _evaluate(plan, threads)) + _MESH * ("mesh" in rendered)
+    drawn = _evaluate(plan, threads) + _PARTITIONED * _gaussians(plan) * selected
+    return max(written, drawn) + _MESH * ("mesh" in rendered)
 
 
 def _report(plan: Plan, threads: int) -> float:

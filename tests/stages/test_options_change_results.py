@@ -156,6 +156,8 @@ FLIPS = {
     "export.formats": Flip(["ply"], POSED),
     "export.sh_degree": Flip(1, POSED),
     "experiments.export.min_opacity": Flip(0.25, POSED),
+    "export.max_gaussians": Flip(100, POSED),
+    "export.region": Flip("subject", POSED),
     "export.mesh_voxel": Flip(0.5, MESH),
     "export.video.path": Flip("cameras", VIDEO),
     "export.video.seconds": Flip(2.0, VIDEO),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
-from pipeline.export.counters import ExportCounters
+from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.io.colmap import write_model
 from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.io.frame_json import RenderSettings, describe_frame
@@ -33,12 +33,13 @@ from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.unrounded import Unrounded
 from pipeline.scene.views import View, scene_up
-from pipeline.splats.arrays import GaussianArrays, GaussianRows
+from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
-# The formats of one file with the Gaussians.
+# The formats of one file with the Gaussians, and those of them that lose some of their precision.
 GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "sog", "splat", "gltf")
+LOSSY_FORMATS = ("spz", "spz4", "sog", "splat")
 
 
 @dataclass(frozen=True)
@@ -229,8 +230,13 @@ def export_scene(
         write(out / file, files)
         if (out / file).exists():
             written.append(file)
+    lossy = [out / WRITERS[name][0] for name in LOSSY_FORMATS if name in config.formats]
     report = ExportReport(
-        ExportCounters(exported_gaussians=len(gaussians)), warnings=_warnings(files, config)
+        ExportCounters(
+            exported_gaussians=len(gaussians),
+            losses=_losses(lossy, files, train, split, threads) if lossy else [],
+        ),
+        warnings=_warnings(files, config),
     )
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")
@@ -284,6 +290,18 @@ def _write_frame(out: Path, files: _Files, written: list[str], train: Train, spl
         given,
         num_invented=int((files.gaussians.rows >= first_invented).sum()),
     ).write(out)
+
+
+def _losses(
+    lossy: list[Path], files: _Files, train: Train, split: Split, threads: int
+) -> list[FileLoss]:
+    """The losses of files that were written."""
+    # The module is imported here because it imports torch.
+    from pipeline.export.losses import measure_losses
+
+    protocol = choose_protocol(files.scene.training_size_views, split, train)
+    gaussians = Gaussians.sharing(collect(files.gaussians))
+    return measure_losses(lossy, gaussians, protocol.views, protocol.options(train, threads))
 
 
 def _write_rendered_formats(

@@ -43,7 +43,7 @@ Doubles = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 _STEPS = (1 << 16) - 1  # Between the least and the largest position.
-_MAX_PALETTE = 1 << 16
+_MAX_PALETTE, _SMALL = 1 << 16, 1 << 10
 # The alpha of rotations is this plus the index (wxyz) of the largest component. The others are at
 # most 1 / sqrt(2).
 _TAG = 252
@@ -197,8 +197,8 @@ def _encode_harmonics(higher: Array) -> tuple[Harmonics, Bytes, Bytes]:
         higher: (N, K - 1, 3) coefficients above degree 0.
     """
     count, coefficients = higher.shape[:2]
-    # As many centroids as PlayCanvas's writer has: a power of two, at most one for each Gaussian.
-    size = min(_MAX_PALETTE, 1 << (count.bit_length() - 1))
+    # As many centroids as PlayCanvas's writer has: a power of two. Small scenes keep every row.
+    size = min(_MAX_PALETTE, max(_SMALL, 1 << (count.bit_length() - 1)))
     palette = make_palette(higher.reshape(count, -1), size)
     codebook = make_codebook(palette.centroids)
     codes = nearest_entries(codebook, palette.centroids).reshape(-1, 3)

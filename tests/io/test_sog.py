@@ -115,12 +115,12 @@ def test_transparent_gaussians_keep_their_colour(tmp_path) -> None:
 
 def test_a_palette_smaller_than_the_scene_keeps_groups_of_harmonics(tmp_path) -> None:
     rng = np.random.default_rng(0)
-    gaussians, kinds = sample(1000, 3), rng.integers(0, 300, 1000)
-    rest = rng.normal(0, 0.2, (300, 15, 3))[kinds] + rng.normal(0, 1e-3, (1000, 15, 3))
+    gaussians, kinds = sample(1500, 3), rng.integers(0, 300, 1500)
+    rest = rng.normal(0, 0.2, (300, 15, 3))[kinds] + rng.normal(0, 1e-3, (1500, 15, 3))
     gaussians.sh[:, 1:] = gaussians.sh.new_tensor(rest)
     write_sog(tmp_path / "a.sog", gaussians)
     meta = json.loads(members(tmp_path / "a.sog")[META])
-    assert meta["shN"]["count"] == 512 and meta["shN"]["bands"] == 3
+    assert meta["shN"]["count"] == 1024 and meta["shN"]["bands"] == 3
     error = (read_sog(tmp_path / "a.sog").sh - gaussians.sh)[:, 1:].numpy()
     assert np.sqrt((error**2).mean()) < 0.05
 

@@ -128,6 +128,7 @@ def test_every_format_the_schema_offers_is_written(scene):
         assert len(found) == len(kept) and found.sh_degree == degree
         coarse = 5e-4 if suffix == ".sog" else 1e-5
         np.testing.assert_allclose(found.means, kept.means, rtol=0, atol=coarse)
+    assert json.loads((out / "sog_lod" / "lod-meta.json").read_text())["counts"][0] == len(kept)
     for folder in ("sparse/0", "sparse_text"):
         model = read_model(out / folder)
         assert len(model.images) == 9 and len(model.points) == 1

@@ -21,6 +21,7 @@ from pipeline.io.sog import write_sog
 from pipeline.io.splat import write_splat
 from pipeline.io.splat_losses import losses, unmarked
 from pipeline.io.spz import write_spz
+from pipeline.io.streamed_sog import write_streamed_sog
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
@@ -137,6 +138,9 @@ class _Files:
     def write_sog(self, path: Path) -> None:
         write_sog(path, self.gaussians, antialias=self.antialias)
 
+    def write_streamed_sog(self, path: Path) -> None:
+        write_streamed_sog(path, self.gaussians, antialias=self.antialias)
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -180,6 +184,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
     "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),
     "sog": ("point_cloud.sog", lambda path, f: f.write_sog(path)),
+    "sog_lod": ("sog_lod", lambda path, f: f.write_streamed_sog(path)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),

@@ -59,20 +59,25 @@ class _Moments:
     covariances' determinants."""
 
     def __init__(self, gaussians: GaussianArrays) -> None:
-        log_scales = gaussians.log_scales.astype(np.float64)
-        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64).clip(-100, 100)))
-        self.weights = np.maximum(opacities * _areas(np.exp(log_scales)), 1e-30)
+        self.weights = weights_of(gaussians)
         self.covariances = np.empty((len(gaussians), 3, 3))
         for start in range(0, len(gaussians), CHUNK):
             rows = slice(start, start + CHUNK)
             quats = gaussians.quats[rows].astype(np.float64)
             norms = np.linalg.norm(quats, axis=1, keepdims=True)
             quats = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), (1.0, 0, 0, 0))
-            variances = np.exp(2 * log_scales[rows])
+            variances = np.exp(2 * gaussians.log_scales[rows].astype(np.float64))
             variances += _FLATTEST * variances.max(1, keepdims=True)
             axes = quat_to_rotation(quats)
             self.covariances[rows] = np.einsum("nij,nj,nkj->nik", axes, variances, axes)
         self.log_dets = _log_dets(self.covariances)
+
+
+def weights_of(gaussians: GaussianArrays) -> Doubles:
+    """(N,) opacities times mean projected areas, up to a factor: what each adds to pictures."""
+    opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64).clip(-100, 100)))
+    areas = _areas(np.exp(gaussians.log_scales.astype(np.float64).clip(-30, 30)))
+    return np.maximum(opacities * areas, 1e-30)
 
 
 def _areas(scales: Doubles) -> Doubles:

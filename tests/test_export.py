@@ -120,13 +120,15 @@ def test_every_format_the_schema_offers_is_written(scene):
         scene, formats=list(WRITERS), sh_degree=1, min_opacity=0.3, morton_order=False
     )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
-    assert job.counters == ExportCounters(exported_gaussians=len(kept))
+    assert isinstance(job.counters, ExportCounters)
+    assert job.counters.exported_gaussians == len(kept)
     files = ((".ply", 1), (".spz", 1), ("_v4.spz", 1), (".sog", 1), (".glb", 1), (".splat", 0))
     for suffix, degree in files:
         found = read_gaussians(out / f"point_cloud{suffix}", [])
         assert len(found) == len(kept) and found.sh_degree == degree
         coarse = 5e-4 if suffix == ".sog" else 1e-5
         np.testing.assert_allclose(found.means, kept.means, rtol=0, atol=coarse)
+    assert json.loads((out / "sog_lod" / "lod-meta.json").read_text())["counts"][0] == len(kept)
     for folder in ("sparse/0", "sparse_text"):
         model = read_model(out / folder)
         assert len(model.images) == 9 and len(model.points) == 1
@@ -266,6 +268,22 @@ def test_transforms_paths_are_relative_to_the_final_folder(scene):
     assert (camera.width, camera.pinhole) == (90, (50, 50, 45, 30))
     content = json.loads((out / "transforms.json").read_text())
     assert len(content["test_filenames"]) == 2 and content["ply_file_path"] == "points.ply"
+
+
+def test_the_loss_of_each_compressed_file_is_measured(scene):
+    out, job = export(scene, formats=["ply", "spz", "sog", "splat", "gltf"])
+    found = {loss.file: loss for loss in job.counters.losses}
+    assert list(found) == ["point_cloud.spz", "point_cloud.sog", "point_cloud.splat"]
+    for name, loss in found.items():
+        assert loss.size_mb == pytest.approx((out / name).stat().st_size / 1e6, abs=5e-4)
+    # Few Gaussians have a palette with an entry each; .splat drops the harmonics.
+    assert found["point_cloud.spz"].psnr > 40 and found["point_cloud.sog"].psnr > 40
+    assert found["point_cloud.splat"].psnr < 35
+
+
+def test_exact_files_have_no_measured_loss(scene):
+    _, job = export(scene, formats=["ply", "gltf"])
+    assert job.counters == ExportCounters(exported_gaussians=50, losses=[])
 
 
 def test_transforms_omit_an_empty_point_cloud(scene):

@@ -20,6 +20,7 @@ ExportFormat = Literal[
     "spz",
     "spz4",
     "sog",
+    "sog_lod",
     "splat",
     "gltf",
     "points",
@@ -53,7 +54,9 @@ class Export(Section):
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
         "scene), spz (version 3, a sixth of the size), spz4 (version 4, which fewer programs "
         "read, for up to 30 million Gaussians instead of 10), sog (PlayCanvas's format, about a "
-        "seventh of the size), splat (without SH), gltf (.glb with KHR_gaussian_splatting). "
+        "seventh of the size), sog_lod (Streamed SOG: a folder of chunks at five levels of detail, "
+        "for large scenes on the web), splat (without SH), gltf (.glb with "
+        "KHR_gaussian_splatting). "
         "points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.export import Export
 from pipeline.config.schema import Split, Train
-from pipeline.export.counters import ExportCounters
+from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.export.selection import Selection, select_gaussians
 from pipeline.io.colmap import write_model
 from pipeline.io.depth_tiff import write_depth_tiff
@@ -23,6 +23,7 @@ from pipeline.io.sog import write_sog
 from pipeline.io.splat import write_splat
 from pipeline.io.splat_losses import losses, unmarked
 from pipeline.io.spz import write_spz
+from pipeline.io.streamed_sog import write_streamed_sog
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
@@ -39,8 +40,9 @@ from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
-# The formats of one file with the Gaussians.
+# The formats of one file with the Gaussians, and those of them that lose some of their precision.
 GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "sog", "splat", "gltf")
+LOSSY_FORMATS = ("spz", "spz4", "sog", "splat")
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,9 @@ class _Files:
     def write_sog(self, path: Path) -> None:
         write_sog(path, self.gaussians, antialias=self.antialias)
 
+    def write_streamed_sog(self, path: Path) -> None:
+        write_streamed_sog(path, self.gaussians, antialias=self.antialias)
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -181,6 +186,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
     "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),
     "sog": ("point_cloud.sog", lambda path, f: f.write_sog(path)),
+    "sog_lod": ("sog_lod", lambda path, f: f.write_streamed_sog(path)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),
@@ -233,8 +239,13 @@ def export_scene(
         write(out / file, files)
         if (out / file).exists():
             written.append(file)
+    lossy = [out / WRITERS[name][0] for name in LOSSY_FORMATS if name in config.formats]
     report = ExportReport(
-        ExportCounters(exported_gaussians=len(gaussians), psnr_against_all=selection.psnr),
+        ExportCounters(
+            exported_gaussians=len(gaussians),
+            psnr_against_all=selection.psnr,
+            losses=_losses(lossy, files, train, split, threads) if lossy else [],
+        ),
         selection.decisions,
         _warnings(files, config),
     )
@@ -306,6 +317,18 @@ def _write_frame(out: Path, files: _Files, written: list[str], train: Train, spl
         given,
         num_invented=int((files.gaussians.rows >= first_invented).sum()),
     ).write(out)
+
+
+def _losses(
+    lossy: list[Path], files: _Files, train: Train, split: Split, threads: int
+) -> list[FileLoss]:
+    """The losses of files that were written."""
+    # The module is imported here because it imports torch.
+    from pipeline.export.losses import measure_losses
+
+    protocol = choose_protocol(files.scene.training_size_views, split, train)
+    gaussians = Gaussians.sharing(collect(files.gaussians))
+    return measure_losses(lossy, gaussians, protocol.views, protocol.options(train, threads))
 
 
 def _write_rendered_formats(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 Labels = NDArray[np.int64]
+Weights = NDArray[np.float64]
 
 # The largest norm of an integer row. With it, |c|^2 - 2 q.c and its partial sums are below 2^24.
 _MAX_NORM = 2300.0
@@ -49,24 +50,57 @@ class Palette:
     labels: Labels
 
 
-def make_palette(rows: Array, size: int) -> Palette:
+def make_palette(rows: Array, weights: Weights, size: int) -> Palette:
     """Quantise ``rows`` (N, D), D up to 45, to at most ``size`` centroids.
 
     Rows that are near each other in their order should be similar or near in space: training uses
     evenly spaced ones.
+
+    Args:
+        weights: (N,) positive weights of the squared errors of the rows. Rows are assigned to the
+            nearest centroid, which is their weighted mean.
     """
     count = len(rows)
     if count <= size:
         return Palette(rows.astype(np.float32), np.arange(count))
     scale, longest = _grid(rows)
-    training = _to_integers(_spread(rows, _ROWS_PER_CENTROID * size), scale, longest)
+    chosen = _spread(count, _ROWS_PER_CENTROID * size)
+    training = _Rows(_to_integers(rows[chosen], scale, longest), weights[chosen])
     tree = _train(training, size)
-    tree = tree.moved(_means(training, tree.nearest(training), tree.centroids))
+    tree = tree.moved(training.means(tree.nearest(training.values), tree.centroids))
     labels = np.empty(count, np.int64)
     for start in range(0, count, _CHUNK):
         chunk = slice(start, start + _CHUNK)
         labels[chunk] = tree.nearest(_to_integers(rows[chunk], scale, longest))
-    return Palette(_means(rows, labels, tree.centroids / np.float32(scale)), labels)
+    centroids = tree.centroids / np.float32(scale)
+    return Palette(_Rows(rows, weights).means(labels, centroids), labels)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows (N, D), and the weight (N,) of the error of each, which is positive."""
+
+    values: Array
+    weights: Weights
+
+    def __getitem__(self, which: Labels) -> _Rows:
+        return _Rows(self.values[which], self.weights[which])
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def means(self, labels: Labels, centroids: Array) -> Array:
+        """The means of the rows of each centroid, in float64 and in the order of the rows;
+        centroids without rows stay."""
+        size = len(centroids)
+        total = np.bincount(labels, self.weights, size)
+        means = centroids.astype(np.float64)
+        for column in range(means.shape[1]):
+            sums = np.bincount(labels, self.values[:, column] * self.weights, size)
+            means[:, column] = np.where(
+                total > 0, sums / np.where(total > 0, total, 1), means[:, column]
+            )
+        return means.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -103,18 +137,18 @@ class _Tree:
         return labels
 
 
-def _train(rows: Array, size: int) -> _Tree:
+def _train(rows: _Rows, size: int) -> _Tree:
     """``size`` centroids of rows of integers: those of each cell are found from its rows."""
     number = max(1, round(size**0.5))
-    some = _spread(rows, _ROWS_PER_CELL * number)
-    cells = _lloyd(some, _spread(some, number), _CELL_ROUNDS)
-    members = _nearest(rows, cells)[0]
+    some = rows[_spread(len(rows), _ROWS_PER_CELL * number)]
+    cells = _lloyd(some, number, _CELL_ROUNDS)
+    members = _nearest(rows.values, cells)[0]
     counts = np.bincount(members, minlength=number)
     shares = _shares(counts, size)
     order = np.argsort(members, kind="stable")
     parts = np.split(order, np.cumsum(counts)[:-1])
     centroids = [
-        _lloyd(rows[part], _spread(rows[part], int(share)), _ROUNDS)
+        _lloyd(rows[part], int(share), _ROUNDS)
         for part, share in zip(parts, shares, strict=True)
         if share
     ]
@@ -130,9 +164,11 @@ def _shares(counts: Labels, size: int) -> Labels:
     return shares
 
 
-def _lloyd(rows: Array, centroids: Array, rounds: int) -> Array:
+def _lloyd(rows: _Rows, size: int, rounds: int) -> Array:
+    """``size`` centroids of rows of integers, at first evenly spaced rows."""
+    centroids = rows.values[_spread(len(rows), size)]
     for _ in range(rounds):
-        means = _means(rows, _nearest(rows, centroids)[0], centroids)
+        means = rows.means(_nearest(rows.values, centroids)[0], centroids)
         centroids = _shortened(np.rint(means)).astype(np.float32)
     return centroids
 
@@ -169,18 +205,6 @@ def _blocks(count: int) -> list[slice]:
     return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
 
 
-def _means(rows: Array, labels: Labels, centroids: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The means of the rows of each centroid, in float64 and in the order of the rows; centroids
-    without rows stay."""
-    size = len(centroids)
-    counts = np.bincount(labels, minlength=size)
-    means = centroids.astype(np.float64)
-    for column in range(rows.shape[1]):
-        sums = np.bincount(labels, rows[:, column], size)
-        means[:, column] = np.where(counts > 0, sums / np.maximum(counts, 1), means[:, column])
-    return means.astype(np.float32)
-
-
 def _grid(rows: Array) -> tuple[float, float]:
     """The factor from rows to integers, and the largest norm of a row that is not shortened."""
     squares = np.concatenate([_squares(rows[b : b + _CHUNK]) for b in range(0, len(rows), _CHUNK)])
@@ -208,7 +232,7 @@ def _squares(rows: NDArray[np.floating]) -> NDArray[np.float64]:
     return found
 
 
-def _spread(rows: Array, count: int) -> Array:
-    """Up to ``count`` evenly spaced rows."""
-    count = min(count, len(rows))
-    return rows[np.arange(count) * len(rows) // max(count, 1)]
+def _spread(number: int, count: int) -> Labels:
+    """Up to ``count`` evenly spaced indices of ``number`` rows."""
+    count = min(count, number)
+    return np.arange(count) * number // max(count, 1)

@@ -38,13 +38,13 @@ from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import Array, GaussianSource, collect
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.levels import weights_of
 
 Doubles = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 _STEPS = (1 << 16) - 1  # Between the least and the largest position.
-_MAX_PALETTE = 1 << 16
-_FEW = 512  # The centroids of so many Gaussians take few bytes.
+_MAX_PALETTE, _SMALL = 1 << 16, 1 << 10
 # The alpha of rotations is this plus the index (wxyz) of the largest component. The others are at
 # most 1 / sqrt(2).
 _TAG = 252
@@ -130,7 +130,9 @@ def encode_sog(gaussians: GaussianSource, *, antialias: bool = False) -> dict[st
     }
     harmonics = None
     if arrays.sh_degree:
-        harmonics, images["shN_labels.webp"], centroids = _encode_harmonics(arrays.sh[:, 1:])
+        harmonics, images["shN_labels.webp"], centroids = _encode_harmonics(
+            arrays.sh[:, 1:], weights_of(arrays)
+        )
     count = len(arrays)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
     files = {name: encode_image(_pixels(values, width)) for name, values in images.items()}
@@ -191,16 +193,17 @@ def _encode_quats(quats: Array) -> Bytes:
     )
 
 
-def _encode_harmonics(higher: Array) -> tuple[Harmonics, Bytes, Bytes]:
+def _encode_harmonics(higher: Array, weights: Doubles) -> tuple[Harmonics, Bytes, Bytes]:
     """The description of the palette, (N, 2) bytes of the labels, and the image of the centroids.
 
     Args:
         higher: (N, K - 1, 3) coefficients above degree 0.
+        weights: (N,) weights of the errors of the Gaussians.
     """
     count, coefficients = higher.shape[:2]
-    # As many centroids as PlayCanvas's writer has, a power of two; one for each Gaussian of a few.
-    size = min(_MAX_PALETTE, 1 << (count.bit_length() - 1)) if count > _FEW else count
-    palette = make_palette(higher.reshape(count, -1), size)
+    # As many centroids as PlayCanvas's writer has: a power of two. Small scenes keep every row.
+    size = min(_MAX_PALETTE, max(_SMALL, 1 << (count.bit_length() - 1)))
+    palette = make_palette(higher.reshape(count, -1), weights, size)
     codebook = make_codebook(palette.centroids)
     codes = nearest_entries(codebook, palette.centroids).reshape(-1, 3)
     harmonics = Harmonics(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipeline.export.counters import ExportCounters
 from pipeline.holes.record import HolesRecord
 from pipeline.metrics.evaluation import Evaluation, SceneQuality
 from pipeline.photos.counters import DecodeCounters, InspectCounters
@@ -49,6 +50,7 @@ def collect_metrics(
     sfm = read_counters(folder / "sfm", SfmCounters) if "sfm" in ran else None
     refined = read_counters(folder / "refine", RefineCounters) if "refine" in ran else None
     decoded = read_counters(folder / "decode", DecodeCounters) if "decode" in ran else None
+    exported = read_counters(folder / "export", ExportCounters) if "export" in ran else None
     frames = sum((decoded.frames_chosen or {}).values()) if decoded else 0
     error_px = refined.error_px if refined else None
     return Metrics.model_validate(
@@ -67,6 +69,7 @@ def collect_metrics(
             "georeference": sfm.georeference if sfm else None,
             "components": sfm.components if sfm else [],
             "gaps": sfm.gaps if sfm else [],
+            "exported": exported.losses if exported else [],
             "stages": {
                 name: {"skipped": not step.run, "reason": step.reason, "jobs": step.jobs}
                 for name, step in plan.stages.items()

@@ -11,6 +11,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from pipeline.export.counters import FileLoss
 from pipeline.holes.record import InventedSummary
 from pipeline.metrics.evaluation import SceneQuality
 from pipeline.plan.values import job_folders
@@ -65,6 +66,9 @@ class Metrics(JsonFile, SceneQuality):
     )
     stages: dict[str, StageStatus] = Field(description="By name of the stage.")
     versions: dict[str, str] = Field(description="Package to its version.")
+    exported: list[FileLoss] = Field(
+        [], description="What each compressed file of Gaussians loses."
+    )
     warnings: list[str] = Field(description="Of the plan and of all stages.")
 
 

@@ -131,6 +131,7 @@ FILES = {
     "a.spz": (3, SPZ),
     "b.spz": (4, SPZ),
     "a.sog": (3, SOG),
+    "meta.json": (3, SOG),
     "a.splat": (3, SPLAT),
 }
 

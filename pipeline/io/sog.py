@@ -44,7 +44,8 @@ Doubles = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 _STEPS = (1 << 16) - 1  # Between the least and the largest position.
-_MAX_PALETTE, _SMALL = 1 << 16, 1 << 10
+_MAX_PALETTE = 1 << 16
+_FEW = 512  # The centroids of so many Gaussians take few bytes.
 # The alpha of rotations is this plus the index (wxyz) of the largest component. The others are at
 # most 1 / sqrt(2).
 _TAG = 252
@@ -201,8 +202,8 @@ def _encode_harmonics(higher: Array, weights: Doubles) -> tuple[Harmonics, Bytes
         weights: (N,) weights of the errors of the Gaussians.
     """
     count, coefficients = higher.shape[:2]
-    # As many centroids as PlayCanvas's writer has: a power of two. Small scenes keep every row.
-    size = min(_MAX_PALETTE, max(_SMALL, 1 << (count.bit_length() - 1)))
+    # As many centroids as PlayCanvas's writer has, a power of two; one for each Gaussian of a few.
+    size = min(_MAX_PALETTE, 1 << (count.bit_length() - 1)) if count > _FEW else count
     palette = make_palette(higher.reshape(count, -1), weights, size)
     codebook = make_codebook(palette.centroids)
     codes = nearest_entries(codebook, palette.centroids).reshape(-1, 3)

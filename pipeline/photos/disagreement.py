@@ -31,8 +31,9 @@ SAME_PLACE, SAME_DIRECTION = 0.005, np.radians(3.0)
 # A view is compared with so many others that have enough points in common, the nearest first: by
 # the distance of the centres as a share of the depth, and the angle between the viewing directions.
 NEIGHBOURS = 4
-# Colours are means over squares of this side in pixels: points are not more accurate.
-WINDOW = 5
+# Colours are means over squares of this share of the longer side, so that they do not depend on the
+# resolution, and of at least so many pixels: points are not more accurate.
+WINDOW, MIN_WINDOW = 1 / 64, 5
 # The ratio of the standard deviation to the median absolute value of a normal distribution.
 TO_DEVIATION = 1.4826
 
@@ -203,7 +204,8 @@ def _log_colours(view: View, projected: Array) -> tuple[NDArray[np.bool_], Array
     """(M,) whether each of the points (M, 3) is usable, and (K, 3) log2 of the colours of those."""
     pixels = load_view(view)
     column, row = projected[:, 0].astype(int), projected[:, 1].astype(int)
-    colours = cv2.blur(pixels.rgb, (WINDOW, WINDOW))[row, column] / 255.0
+    side = max(MIN_WINDOW, round(WINDOW * max(view.width, view.height)))
+    colours = cv2.blur(pixels.rgb, (side, side))[row, column] / 255.0
     usable = ((colours > DARK) & (colours < BRIGHT)).all(axis=1)
     if pixels.mask is not None:
         usable &= pixels.mask[row, column]

@@ -30,7 +30,7 @@ EXPOSURES_DIFFER = 0.2
 # Disagreement on colours (``colour_disagreement``) from which photographs are taken to be in
 # different light. In one light it is .03 with accurate points and up to .11 with vignetting or an
 # automatic tone curve; in several lights, .15 or more.
-COLOURS_DISAGREE = 0.13
+COLOURS_DISAGREE = 0.135
 # In a collection, photographs are taken to be in different light if fewer than this share of them
 # can be compared: those in one light have matches, and so common points.
 MEASURED_SHARE = 0.5

@@ -134,6 +134,9 @@ class _Files:
         """Whether the given world has another origin than the scene's."""
         return bool(self.scene.normalization.origin.any())
 
+    def write_ply(self, path: Path) -> None:
+        write_splat_ply(path, self.gaussians, antialias=self.antialias)
+
     def write_spz(self, path: Path, version: int) -> None:
         write_spz(path, self.gaussians, antialias=self.antialias, version=version)
 
@@ -147,7 +150,8 @@ class _Files:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
             rows = self.gaussians.rows[self.blocks == number]
-            write_splat_ply(path / f"block_{number}.ply", replace(self.gaussians, rows=rows))
+            part = replace(self.gaussians, rows=rows)
+            write_splat_ply(path / f"block_{number}.ply", part, antialias=self.antialias)
 
     def write_points(self, path: Path) -> None:
         points = self.model.points
@@ -181,7 +185,7 @@ class _Files:
 
 # The name of the file or folder of each format, and its writer.
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
-    "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
+    "ply": ("point_cloud.ply", lambda path, f: f.write_ply(path)),
     "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
     "spz": ("point_cloud.spz", lambda path, f: f.write_spz(path, 3)),
     "spz4": ("point_cloud_v4.spz", lambda path, f: f.write_spz(path, 4)),

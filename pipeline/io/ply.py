@@ -9,7 +9,8 @@ reorder properties, so they are read by name.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.bounded import opened_bounded
-from pipeline.io.ply_header import PlyHeader, read_header, wrong
+from pipeline.io.ply_header import ANTIALIASED, PlyHeader, read_header, wrong
 from pipeline.io.splat_codec import FIX
 from pipeline.runtime.atomic import write_pieces
+from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import NAMES, GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
@@ -34,9 +36,14 @@ _DC = tuple(f"f_dc_{i}" for i in range(3))
 _REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
 
 
-def write_splat_ply(path: Path, gaussians: GaussianSource) -> None:
+def write_splat_ply(path: Path, gaussians: GaussianSource, *, antialias: bool = False) -> None:
     """Write Gaussians in 3DGS's layout atomically: 62 floats each at SH degree 3, fewer at lower
-    degrees."""
+    degrees.
+
+    Args:
+        antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation,
+            which a comment of the header records.
+    """
     rest = [f"f_rest_{i}" for i in range(3 * ((gaussians.sh_degree + 1) ** 2 - 1))]
     names = [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
 
@@ -54,7 +61,8 @@ def write_splat_ply(path: Path, gaussians: GaussianSource) -> None:
             )
             yield np.concatenate(columns, axis=1, dtype="<f4").tobytes()
 
-    _write(path, len(gaussians), [("float", name) for name in names], rows())
+    properties = [("float", name) for name in names]
+    _write(path, len(gaussians), properties, rows(), [ANTIALIASED] if antialias else [])
 
 
 def write_points_ply(
@@ -89,11 +97,23 @@ def write_points_ply(
 
 
 def _write(
-    path: Path, count: int, properties: list[tuple[str, str]], body: Iterable[bytes]
+    path: Path,
+    count: int,
+    properties: list[tuple[str, str]],
+    body: Iterable[bytes],
+    comments: Sequence[str] = (),
 ) -> None:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {count}"]
     lines += [f"property {kind} {name}" for kind, name in properties]
     write_pieces(path, chain(["\n".join([*lines, "end_header", ""]).encode()], body))
+
+
+def is_antialiased_ply(path: Path) -> bool:
+    """Whether a PLY file records that the Gaussians were trained with opacity compensation; False
+    for a file that cannot be read."""
+    with contextlib.suppress(UserError), opened_bounded(path, fix=FIX) as file:
+        return read_header(file, path).antialiased
+    return False
 
 
 def read_splat_ply(path: Path) -> Gaussians:

@@ -20,6 +20,10 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+#: The comment that records Mip-Splatting's opacity compensation, in brush's words, which
+#: splat-transform reads. Postshot has others.
+ANTIALIASED = "comment SplatRenderMode: mip"
+_ANTIALIASED = (ANTIALIASED.split(), ["comment", "antialiased", "1"])
 # The limit in bytes: headers have fewer than a hundred lines; a longer one is of another format.
 _MAX_HEADER = 1 << 16
 # More digits are no number of vertices, and slow to convert.
@@ -35,12 +39,15 @@ class PlyHeader:
         fields: The name of each property -> numpy's code of its type.
         byte_order: The sign "<" or ">"; "" for ASCII.
         more: Whether other elements follow.
+        antialiased: Whether a comment records that the Gaussians were trained with Mip-Splatting's
+            opacity compensation.
     """
 
     count: int
     fields: dict[str, str]
     byte_order: str
     more: bool
+    antialiased: bool = False
 
 
 def wrong(path: Path, what: str) -> UserError:
@@ -95,4 +102,5 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     count = elements[0][1] if elements and elements[0][0] == "vertex" else ""
     if not count.isdecimal() or len(count) > _MAX_DIGITS:
         raise wrong(path, "expected 'element vertex COUNT' as the first element, found none")
-    return PlyHeader(int(count), fields, byte_order, len(elements) > 1)
+    antialiased = any(words in _ANTIALIASED for words in lines)
+    return PlyHeader(int(count), fields, byte_order, len(elements) > 1, antialiased)

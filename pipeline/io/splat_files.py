@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.io.frame_json import Frame
 from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
-from pipeline.io.ply import read_splat_ply, write_splat_ply
+from pipeline.io.ply import is_antialiased_ply, read_splat_ply, write_splat_ply
 from pipeline.io.sog import is_antialiased_sog, read_sog, write_sog
 from pipeline.io.splat import read_splat, write_splat
 from pipeline.io.splat_losses import losses, losses_of_reading, suffix_of_format, unmarked
@@ -102,6 +102,8 @@ def write_gaussians(
         write_spz(path, gaussians, antialias=antialias, version=spz_version)
     elif write is write_sog:
         write_sog(path, gaussians, antialias=antialias)
+    elif write is write_splat_ply:
+        write_splat_ply(path, gaussians, antialias=antialias)
     else:
         write(path, gaussians)
     return [*losses(path, gaussians), *(unmarked([path.name]) if antialias else [])]
@@ -115,6 +117,8 @@ def is_antialiased(path: Path) -> bool:
         return read_antialias(path)
     if suffix == ".sog":
         return is_antialiased_sog(path)
+    if suffix == ".ply" and is_antialiased_ply(path):
+        return True
     # Another program's file of this name describes none of our exports.
     with contextlib.suppress(UserError, OSError):
         return is_exported(path) and Frame.read(path.parent).render.antialias

@@ -14,6 +14,8 @@ from pipeline.splats.arrays import GaussianSource
 
 # A smaller share of Gaussians that a format cannot represent is no loss that can be seen.
 TOLERATED_SHARE = 0.05
+#: The formats that record Mip-Splatting's opacity compensation.
+RECORDING = (".ply", ".spz", ".sog")
 
 
 def suffix_of_format(path: Path) -> str:
@@ -74,13 +76,13 @@ def losses_of_reading(path: Path) -> list[str]:
 
 def unmarked(files: Sequence[str]) -> list[str]:
     """The warning that ``files`` do not record the opacity compensation of the training; empty if
-    all of them are SPZ or SOG files, which record it."""
-    names = [name for name in files if suffix_of_format(Path(name)) not in (".spz", ".sog")]
+    all of them are of formats that record it."""
+    names = [name for name in files if suffix_of_format(Path(name)) not in RECORDING]
     if not names:
         return []
     return [
         f"{' and '.join(names)} cannot record that the Gaussians were trained with "
         "train.antialias, and viewers without Mip-Splatting's opacity compensation render them too "
-        "thick. Enable it in the viewer, use an SPZ or SOG file, which record it, or train with "
-        "train.antialias: false"
+        "thick. Enable it in the viewer, use a PLY, SPZ or SOG file, which record it, or train "
+        "with train.antialias: false"
     ]

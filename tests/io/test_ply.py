@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.io.ply import read_splat_ply, write_points_ply, write_splat_ply
+from pipeline.io.splat_files import is_antialiased
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from tests.splats.samples import sample
@@ -189,3 +190,19 @@ def test_point_cloud_layout(tmp_path: Path, with_normals) -> None:
         rows[:, :size].copy().view("<f4"), np.asarray(expected, np.float32)
     )
     np.testing.assert_array_equal(rows[:, size:], rgb)
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+def test_other_programs_comments_on_opacity_compensation_are_read(
+    tmp_path: Path, comment: str
+) -> None:
+    """Brush's and Postshot's."""
+    write_splat_ply(tmp_path / "a.ply", sample(2, 0))
+    assert not is_antialiased(tmp_path / "a.ply")
+    plain = (tmp_path / "a.ply").read_bytes()
+    marked = plain.replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1)
+    (tmp_path / "b.ply").write_bytes(marked)
+    assert is_antialiased(tmp_path / "b.ply")
+    assert_same(read_splat_ply(tmp_path / "b.ply"), sample(2, 0))
+    (tmp_path / "c.ply").write_bytes(b"ply")
+    assert not is_antialiased(tmp_path / "c.ply")

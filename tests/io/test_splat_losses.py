@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 import splatmake
-from pipeline.commands import convert
+from pipeline.commands import Wanted, convert
 from pipeline.io.splat_files import SUFFIXES, is_antialiased, read_gaussians, write_gaussians
+from pipeline.io.splat_losses import RECORDING
 from pipeline.io.spz import write_spz
 from pipeline.splats.gaussians import Gaussians
 from tests.splats.samples import sample
@@ -34,7 +35,7 @@ def through(way: str, tmp_path: Path, target: Path, gaussians: Gaussians) -> lis
         return [str(warning.message) for warning in caught]
     source, warnings = tmp_path / "source.npz", []
     write_gaussians(source, gaussians)
-    convert(source, target, 3, 0.0, False, 3, warnings)
+    convert(source, target, 3, 0.0, False, 3, Wanted(), warnings)
     return warnings
 
 
@@ -85,7 +86,7 @@ def degree_four(flags: int) -> bytes:
 def test_what_is_not_read_of_an_spz_file_is_said(tmp_path: Path, flags: int) -> None:
     source, warnings = tmp_path / "s.spz", []
     source.write_bytes(degree_four(flags))
-    convert(source, tmp_path / "a.ply", 3, 0.0, False, 3, warnings)
+    convert(source, tmp_path / "a.ply", 3, 0.0, False, 3, Wanted(), warnings)
     (said,) = warnings
     assert "s.spz: spherical harmonics of degree 4" in said
     assert ("extensions" in said) == bool(flags)
@@ -100,9 +101,9 @@ def test_what_a_format_holds_is_no_warning(tmp_path: Path, suffix: str) -> None:
 def test_opacity_compensation_is_kept_or_said(tmp_path: Path, suffix: str) -> None:
     source, target, warnings = tmp_path / "s.spz", tmp_path / f"a{suffix}", []
     write_spz(source, sample(40, 0), antialias=True)
-    convert(source, target, 3, 0.0, False, 3, warnings)
+    convert(source, target, 3, 0.0, False, 3, Wanted(), warnings)
     assert len(read_gaussians(target, [])) == 40
-    if suffix in (".spz", ".sog"):
+    if suffix in RECORDING:
         assert is_antialiased(target) and not warnings
     else:
         assert len(warnings) == 1 and "train.antialias" in warnings[0]

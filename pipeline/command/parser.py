@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pipeline.config.section import MAX_GAUSSIANS
 from pipeline.render.registry import DEVICE
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.suggest import did_you_mean, nearest
@@ -101,6 +100,8 @@ def positive(text: str) -> int:
 
 
 def gaussians(text: str) -> int:
+    from pipeline.config.section import MAX_GAUSSIANS
+
     return _whole_number(text, (0,), "a positive whole number", MAX_GAUSSIANS)
 
 

@@ -23,7 +23,7 @@ from pipeline.io.camera_files import read_cameras
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.npz import write_npz
 from pipeline.io.recorded import digest_of
-from pipeline.io.splat_files import read_gaussians
+from pipeline.io.splat_files import is_antialiased, read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
 from pipeline.mvs.maps import DenseCloud, DenseMap, write_dense_cloud, write_map
 from pipeline.photos.found_masks import write_found
@@ -253,8 +253,9 @@ def test_rendered_formats_are_written_on_demand(scene):
 
 def test_formats_without_an_antialias_flag_are_named_in_a_warning(scene):
     """A viewer without opacity compensation renders such files much worse."""
-    out, job = export(scene, antialias=True, formats=["ply", "spz"])
-    assert [text.split()[0] for text in job.warnings] == ["point_cloud.ply"]
+    out, job = export(scene, antialias=True, formats=["ply", "spz", "gltf"])
+    assert [text.split()[0] for text in job.warnings] == ["point_cloud.glb"]
+    assert all(is_antialiased(out / f"point_cloud.{suffix}") for suffix in ("ply", "spz"))
     assert json.loads((out / "frame.json").read_text())["render"]["antialias"]
 
 

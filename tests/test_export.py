@@ -282,6 +282,13 @@ def test_the_loss_of_each_compressed_file_is_measured(scene):
     assert found["point_cloud.splat"].psnr < 35
 
 
+def test_the_loss_of_large_scenes_is_not_measured_and_that_is_said(scene, monkeypatch):
+    monkeypatch.setattr("pipeline.export.write.MAX_MEASURED_LOSSES", 49)
+    out, job = export(scene, formats=["ply", "spz"])
+    assert (out / "point_cloud.spz").is_file() and not job.counters.losses
+    assert any("not measured above 49 Gaussians" in text for text in job.decisions)
+
+
 def test_exact_files_have_no_measured_loss(scene):
     _, job = export(scene, formats=["ply", "gltf"])
     assert job.counters == ExportCounters(exported_gaussians=50, losses=[])

@@ -42,6 +42,10 @@ DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"
 BLOCKS_FORMAT: ExportFormat = "blocks"
 # The format that needs the photographs before undistortion.
 MASKS_FORMAT: ExportFormat = "masks"
+# The files of Gaussians that do not hold every bit of them; their loss is measured.
+LOSSY_FORMATS: tuple[ExportFormat, ...] = ("spz", "spz4", "sog", "splat")
+# The loss of larger scenes is not measured: its renders hold all Gaussians several times.
+MAX_MEASURED_LOSSES = 2_000_000
 # The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 

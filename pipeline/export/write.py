@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
-from pipeline.config.export import Export
+from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, Export
 from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.export.selection import Selection, select_gaussians
@@ -40,9 +40,8 @@ from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
-# The formats of one file with the Gaussians, and those of them that lose some of their precision.
-GAUSSIAN_FORMATS = ("ply", "spz", "spz4", "sog", "splat", "gltf")
-LOSSY_FORMATS = ("spz", "spz4", "sog", "splat")
+# The formats of one file with the Gaussians.
+GAUSSIAN_FORMATS = ("ply", *LOSSY_FORMATS, "gltf")
 
 
 @dataclass(frozen=True)
@@ -244,15 +243,20 @@ def export_scene(
         if (out / file).exists():
             written.append(file)
     lossy = [out / WRITERS[name][0] for name in LOSSY_FORMATS if name in config.formats]
+    measured = lossy if len(gaussians) <= MAX_MEASURED_LOSSES else []
     report = ExportReport(
         ExportCounters(
             exported_gaussians=len(gaussians),
             psnr_against_all=selection.psnr,
-            losses=_losses(lossy, files, train, split, threads) if lossy else [],
+            losses=_losses(measured, files, train, split, threads) if measured else [],
         ),
         selection.decisions,
         _warnings(files, config),
     )
+    if len(measured) < len(lossy):
+        report.decisions.append(
+            f"what compressed files lose is not measured above {MAX_MEASURED_LOSSES:,} Gaussians"
+        )
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")
     _write_frame(out, files, written, train, split)
@@ -331,8 +335,8 @@ def _losses(
     from pipeline.export.losses import measure_losses
 
     protocol = choose_protocol(files.scene.training_size_views, split, train)
-    gaussians = Gaussians.sharing(collect(files.gaussians))
-    return measure_losses(lossy, gaussians, protocol.views, protocol.options(train, threads))
+    options = protocol.options(train, threads)
+    return measure_losses(lossy, files.gaussians, protocol.views, options)
 
 
 def _write_rendered_formats(

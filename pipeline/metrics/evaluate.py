@@ -46,6 +46,10 @@ EXPOSURE_PROTOCOL = (
     "modelled), which are measured at the sparse points, in test photographs as well; "
     "psnr_without_gains is without this"
 )
+VIGNETTING_PROTOCOL = (
+    "renders multiplied by the vignetting of each camera, which is measured at the sparse points "
+    "of the training photographs"
+)
 APPEARANCE_PROTOCOL = (
     "the appearance of each test photograph is fitted on its left half and measured on its "
     "right half (NeRF in the Wild); psnr_without_fit is of the scene's own colours on the same half"
@@ -137,7 +141,7 @@ def evaluate_views(
             lpips=LPIPS_VARIANTS[config.lpips_net] if lpips is not None else reason,
             masks=_describe_masks(protocol, measured),
             background=protocol.background,
-            exposure=EXPOSURE_PROTOCOL if gains else None,
+            exposure=_describe_exposure(gains, appearance),
             appearance=APPEARANCE_PROTOCOL if without_fit is not None else None,
             poses=POSES_PROTOCOL if train.refine_poses else None,
         ),
@@ -174,7 +178,9 @@ def _measure(
             file = out / f"{index:04d}.png"
             image = renderer.with_exposure(found.rgb, view)
             distance = None if lpips is None else found.distance(image, lpips)
-            pending.append(pool.submit(_compare, found, image, distance, file, renderer.gains))
+            # With an appearance of their own, photographs have no gain among the view's gains.
+            has_gain = bool(renderer.gains) and renderer.appearance is None
+            pending.append(pool.submit(_compare, found, image, distance, file, has_gain))
             if len(pending) > threads:
                 collect()
         while pending:
@@ -187,9 +193,13 @@ def _compare(
     image: NDArray[np.uint8],
     lpips: float | None,
     file: Path,
-    gains: ExposureGains,
+    has_gain: bool,
 ) -> _Measured:
-    """Write ``image``, the render with the exposure of its photograph, and compare it with that."""
+    """Write ``image``, the render with the exposure of its photograph, and compare it with that.
+
+    Args:
+        has_gain: Whether the render was multiplied by a gain.
+    """
     Image.fromarray(image).save(file, compress_level=PNG_LEVEL)
     record = ViewMetrics(
         name=found.view,
@@ -197,7 +207,7 @@ def _compare(
         ssim=found.ssim(image),
         flip=found.flip(image),
         lpips=lpips,
-        psnr_without_gains=found.psnr(to_bytes(found.rgb)) if gains else None,
+        psnr_without_gains=found.psnr(to_bytes(found.rgb)) if has_gain else None,
         render=file.name,
     )
     without_fit = None if found.own is None else found.psnr(to_bytes(found.own))
@@ -224,6 +234,12 @@ def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
             f"{train_psnr:.1f} dB): there are too few photographs, or they are too far apart"
         ]
     return []
+
+
+def _describe_exposure(gains: ExposureGains, appearance: Appearance | None) -> str | None:
+    if not gains:
+        return None
+    return EXPOSURE_PROTOCOL if appearance is None else VIGNETTING_PROTOCOL
 
 
 def _describe_masks(protocol: Protocol, measured: Sequence[_Measured]) -> str | None:

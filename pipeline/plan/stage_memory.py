@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from pipeline.config.export import RENDERED_FORMATS
+from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, RENDERED_FORMATS
 from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
@@ -25,8 +25,9 @@ _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0
 _VIEW_MAPS = 15.0
 # MB per photograph of features and matches, and of the mapper's model, both for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
-# Bytes per Gaussian that is held; that is held and rendered; that is rendered with gradients.
-_HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
+# Bytes per Gaussian that is held; that is held and rendered; that is rendered with gradients; that
+# is held, read again from a compressed file and rendered.
+_HELD, _RENDERED, _PARTITIONED, _READ_AGAIN = 250.0, 400.0, 720.0, 1250.0
 # Bytes per pixel of a rendered view; of a view measured in one thread. MB of a thread's band.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # MB of the report's page with its parts, and of a mesh.
@@ -245,10 +246,16 @@ def _export(plan: Plan, threads: int) -> float:
     export = plan.config.export
     rendered = RENDERED_FORMATS.intersection(export.formats)
     selected = export.max_gaussians is not None or export.region is not None
-    if not rendered and not selected:
-        return written
-    drawn = _evaluate(plan, threads) + _PARTITIONED * _gaussians(plan) * selected
-    return max(written, drawn) + _MESH * ("mesh" in rendered)
+    needed = [written]
+    if not set(LOSSY_FORMATS).isdisjoint(export.formats):
+        read = _READ_AGAIN * min(_gaussians(plan), MAX_MEASURED_LOSSES / 1e6)
+        needed.append(
+            _RASTERIZER + _MODEL_VIEWS * _photos(plan) + _IMAGE * _view_pixels(plan) + read
+        )
+    if rendered or selected:
+        drawn = _evaluate(plan, threads) + _PARTITIONED * _gaussians(plan) * selected
+        needed.append(drawn + _MESH * ("mesh" in rendered))
+    return max(needed)
 
 
 def _report(plan: Plan, threads: int) -> float:

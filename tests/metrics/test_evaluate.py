@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.metrics.evaluate import diagnose, evaluate_views
+from pipeline.metrics.evaluate import VIGNETTING_PROTOCOL, diagnose, evaluate_views
 from pipeline.metrics.protocol import NUM_TRAINING_VIEWS, choose_protocol
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
@@ -162,6 +162,26 @@ def test_appearance_is_fitted_on_the_left_half_and_measured_on_the_right(tmp_pat
     alone = measured(views[1:])
     assert alone.psnr > 35
     assert alone.psnr_without_fit is None and alone.protocol.appearance is None
+
+
+def test_appearance_is_fitted_through_the_vignetting_of_the_camera(tmp_path):
+    appearance = Appearance(
+        np.full((1, 1, 3), 0.2 / SH_C0, np.float32), {"b": np.array([1.0]), "c": np.array([-1.0])}
+    )
+    light = ViewLight(gain=(1.0, 1.0, 1.0), vignetting=(-1.0, 0.0))
+    views = []
+    for name, value in (("a", 150), ("b", 178), ("c", 76)):
+        seen = view(tmp_path, name, np.full_like(black(), value), is_test=name == "a")
+        shaded = np.rint(np.full_like(black(), value) * light.factor(seen)).astype(np.uint8)
+        views.append(view(tmp_path, name, shaded, is_test=name == "a"))
+    config = Train(background="black")
+    found = evaluate_views(
+        lit(nothing(), 0.5), choose_protocol(views, Split(), config), Evaluate(), config,
+        tmp_path / "out", gains=ExposureGains(dict.fromkeys("abc", light)), appearance=appearance,
+        threads=1,
+    )  # fmt: skip
+    assert found.psnr > 40 and found.train_psnr > 35
+    assert found.protocol.exposure == VIGNETTING_PROTOCOL and found.psnr_without_gains is None
 
 
 def test_a_mask_of_the_measured_half_hides_the_view(tmp_path):

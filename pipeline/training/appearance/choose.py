@@ -28,8 +28,8 @@ from pipeline.scene.views import View
 # exposure it is 0 to 0.1, in collections from the internet 0.5.
 EXPOSURES_DIFFER = 0.2
 # Disagreement on colours (``colour_disagreement``) from which photographs are taken to be in
-# different light. In one light it is .03 with accurate points and up to .11 with vignetting or an
-# automatic tone curve; in several lights, .15 or more.
+# different light. In one light it is .03 with accurate points and up to .12 with inaccurate ones,
+# vignetting or an automatic tone curve; in several lights, .15 or more.
 COLOURS_DISAGREE = 0.135
 # In a collection, photographs are taken to be in different light if fewer than this share of them
 # can be compared: those in one light have matches, and so common points.

@@ -43,7 +43,7 @@ _RECORDS = {
     "georeference.json": "pipeline.scene.georeference:Georeference",
     "uncertainty.json": "pipeline.sfm.uncertainty_file:Uncertainty",
     "frame.json": "pipeline.io.frame_json:Frame",
-    "path.json": "pipeline.surface.path:PathFile",
+    "path.json": "pipeline.io.camera_paths:PathFile",
     "partition.json": "pipeline.scene.blocks:Partition",
     "holes.json": "pipeline.holes.record:HolesRecord",
 }

@@ -21,7 +21,11 @@ from pipeline.runtime.layout import COMMAND
 from pipeline.runtime.suggest import did_you_mean, nearest
 from pipeline.runtime.text import shortened, shown
 
-_SECTION = "Input should be a mapping of options to values, as in {steps: 2000}"
+# Messages in the words of YAML instead of Python's.
+_MESSAGES = {
+    "model_type": "Input should be a mapping of options to values, as in {steps: 2000}",
+    "tuple_type": "Input should be a list",
+}
 # The quotation marks around a text that ``shown`` quotes.
 _QUOTES = "'\""
 # Further pairs of a scene and a configuration are checked when their run is planned.
@@ -156,7 +160,7 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
             lines.append(f"{path}: no such option{meant}")
             continue
         expected, _ = wrong.setdefault(path, ([], _found(problem)))
-        message = _SECTION if problem["type"] == "model_type" else problem["msg"]
+        message = _MESSAGES.get(problem["type"], problem["msg"])
         expected.append(shortened(message.removeprefix("Value error, "), _MAX_MESSAGE))
     for path, (expected, found) in wrong.items():
         first, *others = dict.fromkeys(expected)

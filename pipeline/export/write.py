@@ -359,6 +359,7 @@ def _write_rendered_formats(
         scene.training_size_views,
         choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),
+        origin=scene.normalization.origin,
         num_invented=scene.num_invented,
     )
     report.decisions += messages.decisions

@@ -25,6 +25,7 @@ from pipeline.surface.video import write_video
 
 #: Number of views from which the typical depth is measured.
 _DEPTH_VIEWS = 8
+_NO_ORIGIN = np.zeros(3)
 
 
 class Messages(NamedTuple):
@@ -42,6 +43,7 @@ def write_rendered(
     options: RasterOptions,
     *,
     up: NDArray[np.float64],
+    origin: NDArray[np.float64] = _NO_ORIGIN,
     num_invented: int = 0,
 ) -> Messages:
     """Write the outputs that ``config.formats`` names: ``renders/``, ``depths/``, ``mesh.ply`` and
@@ -51,6 +53,7 @@ def write_rendered(
         views: All views, at the size to render.
         options: The options of the rasterizer (``Protocol.options``).
         up: (3,) up vector of the world.
+        origin: (3,) the world's origin in the world of the exported cameras.
         num_invented: The number of invented Gaussians, the last ones. Only the video shows them.
     """
     formats = config.formats
@@ -69,7 +72,7 @@ def write_rendered(
                     write_mesh_ply(out / "mesh.ply", mesh)
                     write_mesh_glb(out / "mesh.glb", mesh, up)
     if "video" in formats:
-        _write_video(out, config.video, gaussians, views, options, up, messages)
+        _write_video(out, config.video, gaussians, views, options, up, origin, messages)
     return messages
 
 
@@ -80,19 +83,20 @@ def _write_video(
     views: list[View],
     options: RasterOptions,
     up: NDArray[np.float64],
+    origin: NDArray[np.float64],
     messages: Messages,
 ) -> None:
     depth = _typical_depth(gaussians, views, options)
-    path, words = camera_path(views, depth, up, config)
-    describe_path(path, config.fps).write(out)
+    path = camera_path(views, depth, up, config, origin)
+    describe_path(path).write(out)
     frames = (
         to_bytes(render_rgb(gaussians, view, options))
-        for view in track(path, "rendering the video", len(path), unit="frames")
+        for view in track(path.views, "rendering the video", len(path.views), unit="frames")
     )
-    size = path[0].width, path[0].height
-    encoding = write_video(out / "video.mp4", frames, size, config.fps)
+    size = path.views[0].width, path.views[0].height
+    encoding = write_video(out / "video.mp4", frames, size, path.fps)
     messages.decisions.append(
-        f"video: {words}, {len(path) / config.fps:g} s at {config.fps} frames per second, "
+        f"video: {path.words}, {path.seconds:g} s at {path.fps} frames per second, "
         f"{size[0]}x{size[1]} pixels, {encoding}"
     )
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.config.video import VideoExport
-from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix4
+from pipeline.io.camera_paths import CameraPath, PathFile, read_camera_path
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.suggest import did_you_mean, nearest
 from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
@@ -31,41 +32,65 @@ _CONTROLS_PER_SECOND = 2.0
 _SAMPLES = 32
 
 
-class PathFile(JsonFile, JsonObject):
-    """The camera path of the video: one pinhole camera, a pose for each frame."""
+@dataclass(frozen=True)
+class VideoPath:
+    """The cameras of a video.
 
-    file_name: ClassVar[str] = "path.json"
+    Attributes:
+        views: The camera of each frame.
+        fps: Frames per second.
+        words: A few words about the path.
+    """
 
-    schema_version: Literal[1] = Field(1, description="Version of this file's format.")
-    convention: str = Field(description="Of the poses; sentences for people.")
-    fps: int = Field(gt=0, description="Frames per second.")
-    width: int = Field(gt=0, description="Of a frame, pixels.")
-    height: int = Field(gt=0, description="Of a frame, pixels.")
-    fx: float = Field(description="Focal length along x, pixels.")
-    fy: float = Field(description="Focal length along y, pixels.")
-    cx: float = Field(description="Principal point, pixels.")
-    cy: float = Field(description="Principal point, pixels.")
-    world_to_camera: tuple[Matrix4, ...] = Field(
-        description="4 x 4 by rows, of each frame; unit and frame of the scene."
-    )
+    views: list[View]
+    fps: int
+    words: str
+
+    @property
+    def seconds(self) -> float:
+        """The duration."""
+        return len(self.views) / self.fps
 
 
 def camera_path(
-    views: Sequence[View], depth: float, up: Array, video: VideoExport
-) -> tuple[list[View], str]:
-    """The camera of each frame, and a few words about the path.
+    views: Sequence[View], depth: float, up: Array, video: VideoExport, origin: Array
+) -> VideoPath:
+    """The camera of each frame.
 
     An orbit goes around the subject, at the distance and height of the nearby cameras: a full
-    circle if the cameras surround it, else back and forth. The other path goes through the views in
+    circle if the cameras surround it, else back and forth. Another path goes through the views in
     the order of their names, at constant speed. With the path "auto", it is an orbit if most views
-    look at a common subject, and not if they look outwards or along a way.
+    look at a common subject, and not if they look outwards or along a way. Chosen photographs are
+    met exactly. A file has the camera of each frame.
 
     Args:
         views: At least one view.
         depth: The typical distance of the scene from the cameras, world units.
         up: (3,) unit vector, up in the world.
+        origin: (3,) the origin of the views' world in that of the exported cameras.
+
+    Raises:
+        UserError: A chosen photograph is no view, or the file cannot be read.
     """
-    count = video.num_frames
+    count, frame = video.num_frames, _frame(views, video.long_side_px)
+    if isinstance(video.path, tuple):
+        positions, ahead = _through_chosen(views, video.path, depth, count)
+        words = f"through the cameras of {len(video.path)} chosen photographs"
+    elif video.path_file is not None:
+        return _of_file(read_camera_path(video.path_file), frame, video, origin)
+    else:
+        positions, ahead, words = _found_path(views, depth, up, video)
+    path = [
+        replace(frame, name=f"{i:04d}", world_to_camera=_look_along(p, d, up))
+        for i, (p, d) in enumerate(zip(positions, ahead, strict=True))
+    ]
+    return VideoPath(path, video.fps, words)
+
+
+def _found_path(
+    views: Sequence[View], depth: float, up: Array, video: VideoExport
+) -> tuple[Array, Array, str]:
+    """(N, 3) positions and directions of an orbit or of a path near all cameras, and its words."""
     centres = np.stack([view.centre for view in views])
     forward = np.stack([view.world_to_camera[2, :3] for view in views])
     focus = _focus(centres, forward, depth)
@@ -73,29 +98,75 @@ def camera_path(
         np.radians(30)
     )
     if video.path == "orbit" or (video.path == "auto" and common):
-        offsets, words = _around(centres - focus, up, count)
-        positions, ahead = offsets + focus, -offsets
+        offsets, words = _around(centres - focus, up, video.num_frames)
+        return offsets + focus, -offsets, words
+    controls = round(video.seconds * _CONTROLS_PER_SECOND)
+    positions, ahead = _through(centres, forward, depth, controls, video.num_frames)
+    return positions, ahead, "through the cameras in the order of their names"
+
+
+def _through_chosen(
+    views: Sequence[View], names: Sequence[str], depth: float, count: int
+) -> tuple[Array, Array]:
+    """(count, 3) positions and directions on a cubic spline that meets the chosen cameras, at
+    constant speed; a loop if the first is also the last."""
+    by_name = {view.name: view for view in views}
+    for name in names:
+        if name not in by_name:
+            raise UserError(
+                f"export.video.path: {name} is not a photograph of the scene with a pose"
+                f"{did_you_mean(nearest(name, by_name))}",
+                fix="choose among the names in images.json of the stage inspect",
+            )
+    chosen = [by_name[name] for name in names]
+    centres = np.stack([view.centre for view in chosen])
+    forward = np.stack([view.world_to_camera[2, :3] for view in chosen])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1) / depth
+    steps += np.linalg.norm(np.diff(forward, axis=0), axis=1)
+    if not (steps > 0).all():
+        raise UserError(
+            "export.video.path: two photographs that follow each other have the same camera",
+            fix="leave out one of them",
+        )
+    loop = names[0] == names[-1] and len(names) > 3
+    # Centripetal: no loops between cameras at uneven distances.
+    knots = np.append(0.0, np.cumsum(np.sqrt(steps)))
+    table = np.concatenate([centres, forward], axis=1)
+    curve = CubicSpline(knots, table, bc_type="periodic" if loop else "natural")
+    return _at_constant_speed(curve, knots, depth, count)
+
+
+def _of_file(path: CameraPath, frame: View, video: VideoExport, origin: Array) -> VideoPath:
+    """The cameras of a file, at the size and rate of the file, or else those of the options."""
+    if path.size is not None:
+        largest = max(path.size)
+        scale = 1.0 if video.long_side_px is None else video.long_side_px / largest
+        width, height = _even(path.size, scale)
     else:
-        controls = round(video.seconds * _CONTROLS_PER_SECOND)
-        positions, ahead = _through(centres, forward, depth, controls, count)
-        words = "through the cameras in the order of their names"
-    frame = _frame(views, video.long_side_px)
-    path = [
-        replace(frame, name=f"{i:04d}", world_to_camera=_look_along(p, d, up))
-        for i, (p, d) in enumerate(zip(positions, ahead, strict=True))
+        width, height = frame.width, frame.height
+    poses = path.world_to_camera.copy()
+    if path.world == "cameras":
+        poses[:, :3, 3] += np.einsum("nij,j->ni", poses[:, :3, :3], origin)
+    frame = replace(frame, width=width, height=height, cx=width / 2, cy=height / 2)
+    views = [
+        replace(frame, name=f"{i:04d}", fx=f * height, fy=f * height, world_to_camera=pose)
+        for i, (f, pose) in enumerate(zip(path.focal, poses, strict=True))
     ]
-    return path, words
+    words = f"along the {len(views)} cameras of {video.path} ({path.label})"
+    return VideoPath(views, path.fps or video.fps, words)
 
 
-def describe_path(path: Sequence[View], fps: int) -> PathFile:
+def describe_path(path: VideoPath) -> PathFile:
     """The content of ``path.json``."""
-    first = path[0]
+    first = path.views[0]
+    factors = tuple(view.fy / first.fy for view in path.views)
     return PathFile(
         convention="world to camera, 4x4 by rows; x right, y down, z forward; pixel centres at "
-        "half integers; unit and frame of sparse/0",
-        fps=fps,
+        "half integers; unit and frame of the exported Gaussians (frame.json)",
+        fps=path.fps,
         **{name: getattr(first, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
-        world_to_camera=tuple(view.world_to_camera.tolist() for view in path),
+        focal_factors=None if set(factors) == {1.0} else factors,
+        world_to_camera=tuple(view.world_to_camera.tolist() for view in path.views),
     )
 
 
@@ -172,7 +243,16 @@ def _through(
     inner = np.linspace(0.0, 1.0, len(centres) - degree + 1)
     knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])
     curve = BSpline(knots, np.concatenate([centres, forward], axis=1), degree)
-    samples = np.linspace(0.0, 1.0, _SAMPLES * len(centres) + 1)
+    return _at_constant_speed(curve, np.linspace(0.0, 1.0, len(centres) + 1), depth, count)
+
+
+def _at_constant_speed(
+    curve: Callable[[Array], Array], knots: Array, depth: float, count: int
+) -> tuple[Array, Array]:
+    """(count, 3) positions and directions on a curve of both, from its first to its last knot; the
+    picture's motion at ``depth`` is constant."""
+    parts = np.arange(_SAMPLES * (len(knots) - 1) + 1) / _SAMPLES
+    samples = np.interp(parts, np.arange(len(knots)), knots)
     position, ahead = np.split(curve(samples), 2, axis=1)
     moved = np.linalg.norm(np.diff(position, axis=0), axis=1) / depth
     turned = np.linalg.norm(np.diff(_unit(ahead), axis=0), axis=1)
@@ -215,8 +295,7 @@ def _frame(views: Sequence[View], long_side: int | None) -> View:
     size = Counter((view.width, view.height) for view in views).most_common(1)[0][0]
     alike = [view for view in views if (view.width, view.height) == size]
     scale = 1.0 if long_side is None else long_side / max(size)
-    # Down to even: no frame is larger than the views unless it is to be.
-    width, height = (max(2, 2 * int(side * scale / 2 + 1e-9)) for side in size)
+    width, height = _even(size, scale)
     focal = float(np.median([view.fx / view.width for view in alike])) * width
     return replace(
         alike[0],
@@ -229,3 +308,9 @@ def _frame(views: Sequence[View], long_side: int | None) -> View:
         is_test=True,
         crop=None,
     )
+
+
+def _even(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """A scaled size, rounded down to even sides: no frame is larger than asked for."""
+    width, height = (max(2, 2 * int(side * scale / 2 + 1e-9)) for side in size)
+    return width, height

@@ -31,6 +31,8 @@ from pipeline.runtime.errors import UserError
         ({"export": {"video": {"long_side_px": 0}}}, "export.video.long_side_px"),
         ({"export": {"video": {"long_side_px": 100_000}}}, "export.video.long_side_px"),
         ({"export": {"video": {"path": "spiral"}}}, "export.video.path"),
+        ({"export": {"video": {"path": ["a.jpg"]}}}, "export.video.path"),
+        ({"export": {"video": {"path": 3}}}, "Input should be 'auto', 'orbit' or 'cameras'"),
         ({"train": {"ssim_loss_weight": float("nan")}}, "train.ssim_loss_weight"),
         (
             {"train": {"density": {"max_gausians": 5}}},

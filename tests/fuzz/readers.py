@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io import exr, pillow_formats
 from pipeline.io.arrays import read_array
+from pipeline.io.camera_paths import read_camera_path
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.gcp import read_ground_control
 from pipeline.io.llff import read_poses_bounds
@@ -45,6 +46,7 @@ from tests.fuzz.pictures import PICTURES
 from tests.fuzz.poses import POSES
 from tests.fuzz.reader import Files, Reader, of_file, same
 from tests.fuzz.videos import VIDEOS
+from tests.io.camera_paths import FRAMES, NERFSTUDIO, path_file
 from tests.pictures import picture
 from tests.splats.samples import sample
 from tests.videos import write_video
@@ -230,6 +232,11 @@ def video_seeds() -> Sequence[Files]:
         return [{f"x{path.suffix}": path.read_bytes()} for path in paths]
 
 
+def camera_path_seeds() -> Sequence[Files]:
+    contents = (path_file().model_dump(), NERFSTUDIO, FRAMES)
+    return [{"path.json": json.dumps(content).encode()} for content in contents]
+
+
 def depth_seeds() -> Sequence[Files]:
     found = []
     for dtype in ("<f4", "<u2", "<f8"):
@@ -269,6 +276,7 @@ READERS: dict[str, Reader] = {
     "splat": Reader(gaussian_seeds(".splat"), read_any_gaussians),
     "glb": Reader(gaussian_seeds(".glb"), read_any_gaussians, unpack_glb, pack_glb),
     "npz": Reader(gaussian_seeds(".npz"), read_any_gaussians, unpack_zip, pack_zip),
+    "camera-path": Reader(camera_path_seeds, of_file(read_camera_path), weight=0.3),
     "npy": Reader(depth_seeds, of_file(read_npy)),
     "jpeg": Reader(photo_seeds(".jpg"), read_photo),
     "png": Reader(photo_seeds(".png"), read_photo, same, pack_png),

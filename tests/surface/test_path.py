@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.config.video import VideoExport
+from pipeline.runtime.errors import UserError
 from pipeline.surface import path as path_module
 from pipeline.surface.path import describe_path
+from tests.io.camera_paths import CENTRES, NERFSTUDIO
 from tests.surface.scenes import view_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -17,7 +20,7 @@ THREE_SECONDS = VideoExport(seconds=3)
 
 
 def camera_path(views, depth, up, video=THREE_SECONDS):
-    return path_module.camera_path(views, depth, up, video)[0]
+    return path_module.camera_path(views, depth, up, video, np.zeros(3)).views
 
 
 def ring(degrees, radius=3.0, height=1.0, count=24):
@@ -134,10 +137,69 @@ def test_cameras_straight_above():
 def test_frames_have_even_sides_and_the_field_of_view_of_the_views(size, long_side, expected):
     views = [replace(view, width=size[0], height=size[1]) for view in ring(360)]
     video = VideoExport(seconds=2, fps=4, long_side_px=long_side)
-    path = camera_path(views, 3.0, UP, video)
-    assert (path[0].width, path[0].height) == expected
-    assert np.isclose(path[0].fx / path[0].width, 110 / size[0])
-    described = describe_path(path, video.fps)
+    path = path_module.camera_path(views, 3.0, UP, video, np.zeros(3))
+    frame = path.views[0]
+    assert (frame.width, frame.height) == expected
+    assert np.isclose(frame.fx / frame.width, 110 / size[0])
+    described = describe_path(path)
     assert len(described.world_to_camera) == 8
-    assert np.array_equal(described.world_to_camera[7], path[7].world_to_camera)
+    assert np.array_equal(described.world_to_camera[7], path.views[7].world_to_camera)
     assert (described.width, described.height, described.fps) == (*expected, 4)
+
+
+def named_ring():
+    return [replace(view, name=f"{i}.jpg") for i, view in enumerate(ring(360))]
+
+
+def test_a_spline_meets_the_chosen_cameras_in_their_order():
+    views = named_ring()
+    video = VideoExport(path=("0.jpg", "3.jpg", "9.jpg", "7.jpg"), seconds=20)
+    path = camera_path(views, 3.0, UP, video)
+    check_smooth(path, closed=False)
+    at = centres(path)
+    distances = np.linalg.norm(at[:, None] - centres(views)[[0, 3, 9, 7]], axis=2)
+    assert (distances.min(0) < 0.02).all(), "the path misses a chosen camera"
+    assert (np.diff(distances.argmin(0)) > 0).all(), "the order is not the one that was chosen"
+
+
+def test_a_spline_that_ends_where_it_starts_is_a_loop_without_a_corner():
+    video = VideoExport(path=("0.jpg", "6.jpg", "12.jpg", "18.jpg", "0.jpg"), seconds=10)
+    path = camera_path(named_ring(), 3.0, UP, video)
+    at = centres(path)
+    first, last = at[1] - at[0], at[-1] - at[-2]
+    assert np.allclose(at[0], at[-1], atol=1e-9)
+    assert first @ last > 0.99 * np.linalg.norm(first) * np.linalg.norm(last)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(("0.jpg", "3.jpgg"), "did you mean 3.jpg"), (("0.jpg", "0.jpg"), "have the same camera")],
+)
+def test_photographs_that_make_no_path_are_refused(names, message):
+    with pytest.raises(UserError, match=message):
+        camera_path(named_ring(), 3.0, UP, VideoExport(path=names))
+
+
+def test_a_video_can_be_repeated_from_its_own_path_at_another_size(tmp_path):
+    views = ring(120)
+    first = path_module.camera_path(views, 3.0, UP, THREE_SECONDS, np.zeros(3))
+    describe_path(first).write(tmp_path)
+    video = VideoExport(path=str(tmp_path / "path.json"), long_side_px=48, fps=7)
+    again = path_module.camera_path(views[:2], 3.0, UP, video, np.ones(3))
+    assert again.fps == first.fps, "the file's rate counts"
+    assert (again.views[0].width, again.views[0].height) == (48, 48)
+    assert np.isclose(again.views[0].fx, first.views[0].fx / 2)
+    for one, two in zip(first.views, again.views, strict=True):
+        assert np.allclose(one.world_to_camera, two.world_to_camera, atol=1e-12)
+
+
+def test_other_programs_paths_are_in_the_world_of_the_exported_cameras(tmp_path):
+    """The Gaussians' world has another origin than that of transforms.json."""
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps(NERFSTUDIO))
+    video = VideoExport(path=str(file))
+    origin = np.array([100.0, 200.0, 0.0])
+    path = path_module.camera_path(ring(90), 3.0, UP, video, origin)
+    assert np.allclose(centres(path.views), CENTRES - origin)
+    assert np.allclose([view.fy / view.height for view in path.views], [1, 2]), "it zooms"
+    assert describe_path(path).focal_factors == pytest.approx((1, 2))

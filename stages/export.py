@@ -10,7 +10,6 @@ Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``sog_
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
@@ -21,6 +20,7 @@ from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
+from pipeline.plan.video_path import check_video_path
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
@@ -37,18 +37,8 @@ FULL_SIZE = Views(max_long_side_px=MAX_SIDE_PX)
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config
     reason = ", ".join(config.export.formats) or "no format"
-    _video_path(config.export)
+    check_video_path(scan, config.export)
     return StagePlan(run=True, reason=reason, decisions=check_mesh_voxel(scan, config))
-
-
-def _video_path(export: Export) -> Path | None:
-    """The file with the video's cameras, which must be readable before any job starts."""
-    from pipeline.io.camera_paths import read_camera_path
-
-    named = export.video.path_file if "video" in export.formats else None
-    if named is not None:
-        read_camera_path(named)
-    return named
 
 
 def work(job: Job) -> None:
@@ -60,7 +50,7 @@ def work(job: Job) -> None:
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
-    _check_video_path(job)
+    _check_unchanged(job)
     train = inputs.drawing(job)
     use_device(train.device)
     manifest, model, split = (
@@ -119,17 +109,21 @@ def facts(plan: Plan) -> dict[str, Any]:
         return {}
     from pipeline.surface.video import find_h264
 
-    named = _video_path(plan.config.export)
-    digest = None if named is None else hashlib.sha256(named.read_bytes()).hexdigest()
-    return {"h264": find_h264() is not None, "video_path": digest}
+    return {"h264": find_h264() is not None, "video_path": _digest(plan.config.export)}
 
 
-def _check_video_path(job: Job) -> None:
+def _digest(export: Export) -> str | None:
+    """The digest of the file with the video's cameras; None without one."""
+    named = export.video.path_file
+    return None if named is None else hashlib.sha256(named.read_bytes()).hexdigest()
+
+
+def _check_unchanged(job: Job) -> None:
     """Raises: UserError: the file with the video's cameras changed after the run had started."""
-    named = job.section(Export).video.path_file
-    digest = job.key.get("video_path")
-    if digest and named and hashlib.sha256(named.read_bytes()).hexdigest() != digest:
-        raise UserError("changed while the run went on", file=named, fix="start the run again")
+    export = job.section(Export)
+    if "video" in export.formats and _digest(export) != job.key["video_path"]:
+        file = export.video.path_file
+        raise UserError("changed while the run went on", file=file, fix="start the run again")
 
 
 SPEC = StageSpec(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ _MIN_SWING = 6.0
 _CONTROLS_PER_SECOND = 2.0
 #: Number of samples between control points, from which the speed along the path is computed.
 _SAMPLES = 32
+#: The suffix of images that a stage wrote anew.
+_WRITTEN = ".png"
 
 
 @dataclass(frozen=True)
@@ -111,14 +114,7 @@ def _through_chosen(
     """(count, 3) positions and directions on a cubic spline that meets the chosen cameras, at
     constant speed; a loop if the first is also the last."""
     by_name = {view.name: view for view in views}
-    for name in names:
-        if name not in by_name:
-            raise UserError(
-                f"export.video.path: {name} is not a photograph of the scene with a pose"
-                f"{did_you_mean(nearest(name, by_name))}",
-                fix="choose among the names in images.json of the stage inspect",
-            )
-    chosen = [by_name[name] for name in names]
+    chosen = [_view_of(name, by_name) for name in names]
     centres = np.stack([view.centre for view in chosen])
     forward = np.stack([view.world_to_camera[2, :3] for view in chosen])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1) / depth
@@ -134,6 +130,18 @@ def _through_chosen(
     table = np.concatenate([centres, forward], axis=1)
     curve = CubicSpline(knots, table, bc_type="periodic" if loop else "natural")
     return _at_constant_speed(curve, knots, depth, count)
+
+
+def _view_of(photograph: str, views: Mapping[str, View]) -> View:
+    """The view of a photograph, whose name has another suffix if the view was written anew."""
+    written = str(PurePosixPath(photograph).with_suffix(_WRITTEN))
+    for name in (photograph, photograph + _WRITTEN, written):
+        if name in views:
+            return views[name]
+    raise UserError(
+        f"export.video.path: {photograph} has no pose{did_you_mean(nearest(photograph, views))}",
+        fix="choose photographs with a pose, which the page of the result shows",
+    )
 
 
 def _of_file(path: CameraPath, frame: View, video: VideoExport, origin: Array) -> VideoPath:

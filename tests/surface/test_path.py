@@ -147,12 +147,14 @@ def test_frames_have_even_sides_and_the_field_of_view_of_the_views(size, long_si
     assert (described.width, described.height, described.fps) == (*expected, 4)
 
 
-def named_ring():
-    return [replace(view, name=f"{i}.jpg") for i, view in enumerate(ring(360))]
+def named_ring(suffix=".jpg"):
+    return [replace(view, name=f"{i}{suffix}") for i, view in enumerate(ring(360))]
 
 
-def test_a_spline_meets_the_chosen_cameras_in_their_order():
-    views = named_ring()
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".jpg.png"])
+def test_a_spline_meets_the_chosen_cameras_in_their_order(suffix):
+    """Undistorted views have other suffixes than their photographs."""
+    views = named_ring(suffix)
     video = VideoExport(path=("0.jpg", "3.jpg", "9.jpg", "7.jpg"), seconds=20)
     path = camera_path(views, 3.0, UP, video)
     check_smooth(path, closed=False)

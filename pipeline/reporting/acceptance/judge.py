@@ -103,6 +103,10 @@ _CHECKS = {
     ),
     "max_floaters": _Check("floaters", _field("floaters"), "", 0, "no surface is certain"),
     "max_gaussians": _Check("Gaussians", _field("gaussians")),
+    "min_file_psnr": _Check(
+        *("PSNR of the lossiest file", _field("file_psnr"), "dB", 2),
+        "no compressed file was exported, or the scene is too large",
+    ),
     "max_residual_m": _Check("residual of the georeference", _field("residual_m"), "m", 3),
     "max_minutes": _Check("time", _field("minutes"), "minutes", 1),
     "max_memory_mb": _Check("peak memory", _field("memory_mb"), "MB", 0),

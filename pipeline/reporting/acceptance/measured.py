@@ -53,6 +53,10 @@ class Measured(JsonObject):
     )
     floaters: int | None = Field(description="Number of opaque Gaussians in front of cameras.")
     gaussians: int = Field(description="Number of trained Gaussians.")
+    file_psnr: float | None = Field(
+        None,
+        description="Lowest PSNR of a compressed file against the exact Gaussians, dB.",
+    )
     residual_m: float | None = Field(
         description="Median horizontal residual of the georeference, metres."
     )
@@ -84,6 +88,7 @@ def measured_of(metrics: Metrics, coverage: CoverageRecord | None = None) -> Mea
         contradicted_share=novel.contradicted_share if novel else None,
         floaters=floaters.num_gaussians if floaters else None,
         gaussians=metrics.num_gaussians,
+        file_psnr=min((loss.psnr for loss in metrics.exported), default=None),
         residual_m=residuals.horizontal_median if residuals else None,
         minutes=sum(stage.wall_s for stage in timed) / 60 if timed else None,
         memory_mb=max(stage.peak_rss_mb for stage in timed) if timed else None,

@@ -63,6 +63,11 @@ class Rules(Section):
         None, description="Number of opaque Gaussians in front of cameras, before any surface."
     )
     max_gaussians: GaussianCount | None = Field(None, description="Number of trained Gaussians.")
+    min_file_psnr: Decibels | None = Field(
+        None,
+        description="Lowest PSNR of the renders of a compressed file (SPZ, SOG, splat) against "
+        "those of the exact Gaussians. Only for results with such a file.",
+    )
     max_residual_m: Metres | None = Field(
         None,
         description="Median horizontal residual of the georeference. Only for scenes that GPS or "

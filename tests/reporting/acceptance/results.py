@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.command.main import main
+from pipeline.export.counters import FileLoss
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.atomic import write_json, write_text
 from pipeline.runtime.record import RunRecord
 from pipeline.scene.georeference import GeoreferenceSummary, ResidualSummary
 from tests.reporting.made import coverage, metrics
 
-GOOD = {"psnr": 28.0, "ssim": 0.9, "train_psnr": 30.0, "warnings": []}
+SPZ = FileLoss(file="point_cloud.spz", size_mb=1.2, psnr=55.0)
+GOOD = {"psnr": 28.0, "ssim": 0.9, "train_psnr": 30.0, "warnings": [], "exported": [SPZ]}
 PLACED = GeoreferenceSummary(
     method="gps",
     origin=None,

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.export.counters import FileLoss
 from pipeline.reporting.acceptance.command import Criteria, badge
 from pipeline.reporting.acceptance.judge import Acceptance, judge
 from pipeline.reporting.acceptance.measured import measured_of
 from pipeline.reporting.acceptance.rules import Rules, read_rules
 from pipeline.runtime.errors import EXIT_NOT_ACCEPTED, EXIT_USER_ERROR
 from pipeline.sfm.counters import Gap
-from tests.reporting.acceptance.results import PLACED, accept, write_result
+from tests.reporting.acceptance.results import PLACED, SPZ, accept, write_result
 from tests.reporting.made import coverage, metrics
 
 ALL = """
@@ -28,6 +29,7 @@ min_seen_share: 0.5
 max_gaps: 0
 max_contradicted_share: 0.1
 max_floaters: 20
+min_file_psnr: 45
 max_gaussians: 200000
 max_minutes: 5
 max_memory_mb: 2000
@@ -48,6 +50,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "min_seen_share": ({"seen": 0.2}, "20.0 %, at least 50 % wanted"),
     "max_gaps": ({"gaps": [GAP]}, "gaps between parts of the scene 1, at most 0 wanted"),
     "max_contradicted_share": ({"contradicted": 0.2}, "20.0 %, at most 10 % wanted"),
+    "min_file_psnr": (
+        {"exported": [SPZ, FileLoss(file="point_cloud.sog", size_mb=0.6, psnr=39.0)]},
+        "PSNR of the lossiest file 39.00 dB, at least 45 dB wanted",
+    ),
     "max_gaussians": ({"num_gaussians": 200_001}, "200,001, at most 200,000 wanted"),
     "max_minutes": ({"minutes": 6.0}, "time 6.0 minutes, at most 5 minutes wanted"),
     "max_memory_mb": ({"memory_mb": 2500.0}, "2,500 MB, at most 2,000 MB wanted"),
@@ -85,6 +91,12 @@ def test_each_fault_is_found_by_its_rule_and_said(scene, capsys, rule):
     relative = {"max_minutes": "max_time_factor", "max_memory_mb": "max_memory_factor"}
     also = {"min_psnr": "max_psnr_drop", "min_ssim": "max_ssim_drop"} | relative
     assert broken == {rule} | ({also[rule]} if rule in also else set())
+
+
+def test_without_a_compressed_file_its_rule_is_not_met(scene, capsys):
+    write_result(scene, exported=[])
+    assert accept(scene, "min_file_psnr: 30\n") == EXIT_NOT_ACCEPTED
+    assert "not measured (no compressed file was exported" in capsys.readouterr().out
 
 
 def test_floaters_gaps_and_residuals_have_rules(scene, capsys):

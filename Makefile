@@ -37,7 +37,7 @@ TORCH_FROM := $(if $(filter cpu,$(TORCH)),--index-url https://download.pytorch.o
 
 # A stamp file each: the program's own packages, and those of its extras. requirements/ has exact
 # versions with digests, of all packages but torch: its builds differ by machine.
-EXTRAS := watch gpu dev test docs slurm
+EXTRAS := watch gpu usd dev test docs slurm
 $(VENV)/product: requirements/product.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
@@ -103,7 +103,7 @@ test-native: setup $(VENV)/dev
 	@$(BIN)/python -m pytest $(NATIVE_TESTS) -k "not gpu and not device and not resident" -n $(WORKERS) --dist worksteal
 
 # Other projects' readers and decoders: without them, the tests that compare with them are skipped.
-test-packages: $(VENV)/test $(READERS)/node_modules/.package-lock.json
+test-packages: $(VENV)/test $(VENV)/usd $(READERS)/node_modules/.package-lock.json
 
 $(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json
 	@echo "installing Node's packages into $(READERS)"

@@ -1,8 +1,8 @@
 """Files for other programs.
 
 Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``sog_lod/``, ``.splat``,
-``.glb``); sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP;
-``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
+``.glb``, ``.usdc``); sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``,
+COLMAP; ``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
 ``dense_points.ply``, ``dense_maps/``, ``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and
 ``.glb``, ``video`` and ``path.json``.
 """
@@ -17,6 +17,7 @@ from pipeline.config.export import BLOCKS_FORMAT, DENSE_FORMATS, MASKS_FORMAT, E
 from pipeline.config.schema import Split, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
+from pipeline.io.usd import check_usd
 from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
@@ -38,6 +39,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config
     reason = ", ".join(config.export.formats) or "no format"
     check_video_path(scan, config.export)
+    if "usd" in config.export.formats:
+        check_usd()
     return StagePlan(run=True, reason=reason, decisions=check_mesh_voxel(scan, config))
 
 

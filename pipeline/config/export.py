@@ -23,6 +23,7 @@ ExportFormat = Literal[
     "sog_lod",
     "splat",
     "gltf",
+    "usd",
     "points",
     "colmap",
     "colmap_text",
@@ -60,7 +61,8 @@ class Export(Section):
         "read, for up to 30 million Gaussians instead of 10), sog (PlayCanvas's format, about a "
         "seventh of the size), sog_lod (Streamed SOG: a folder of chunks at five levels of detail, "
         "for large scenes on the web), splat (without SH), gltf (.glb with "
-        "KHR_gaussian_splatting). "
+        "KHR_gaussian_splatting), usd (.usdc, OpenUSD's ParticleField3DGaussianSplat; needs the "
+        "extra `usd`). "
         "points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "

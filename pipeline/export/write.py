@@ -25,6 +25,7 @@ from pipeline.io.splat_losses import losses, unmarked
 from pipeline.io.spz import write_spz
 from pipeline.io.streamed_sog import write_streamed_sog
 from pipeline.io.transforms import write_transforms
+from pipeline.io.usd import write_usd
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
 from pipeline.photos.found_masks import PosedPhotos, write_photo_masks
@@ -41,7 +42,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
 # The formats of one file with the Gaussians.
-GAUSSIAN_FORMATS = ("ply", *LOSSY_FORMATS, "gltf")
+GAUSSIAN_FORMATS = ("ply", *LOSSY_FORMATS, "gltf", "usd")
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,9 @@ class _Files:
     def write_streamed_sog(self, path: Path) -> None:
         write_streamed_sog(path, self.gaussians, antialias=self.antialias)
 
+    def write_usd(self, path: Path) -> None:
+        write_usd(path, self.gaussians, scene_up(self.scene.views, self.scene.manifest))
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -192,6 +196,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "sog_lod": ("sog_lod", lambda path, f: f.write_streamed_sog(path)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
+    "usd": ("point_cloud.usdc", lambda path, f: f.write_usd(path)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),
     "colmap": ("sparse/0", lambda path, f: write_model(path, f.model)),
     "colmap_text": ("sparse_text", lambda path, f: write_model(path, f.model, text=True)),

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from pipeline.io import usd
 from pipeline.io.frame_json import Frame
 from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
@@ -28,8 +29,10 @@ _FORMATS: dict[str, _Format] = {
     ".splat": (read_splat, write_splat),
     ".glb": (read_gltf, write_gltf),
     ".npz": (read_npz, write_npz),
+    usd.SUFFIX: (usd.refuse_usd, usd.write_usd),
 }
-SUFFIXES = tuple(_FORMATS)
+#: The suffixes of files that are read and written.
+SUFFIXES = tuple(suffix for suffix in _FORMATS if suffix != usd.SUFFIX)
 # Replaces infinite logarithms and logits by finite ones; exp(-30) is negligible.
 _LARGE = 30.0
 

@@ -26,6 +26,7 @@ _LABELS = {
     "point_cloud.sog": "Gaussians, compact, for PlayCanvas (SOG)",
     "point_cloud.splat": "Gaussians, for web viewers (.splat)",
     "point_cloud.glb": "Gaussians (glTF)",
+    "point_cloud.usdc": "Gaussians (OpenUSD)",
     "mesh.glb": "Mesh with colours (glTF)",
     "mesh.ply": "Mesh with colours (PLY)",
     "points.ply": "Sparse points (PLY)",

@@ -4,7 +4,8 @@ Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``sog_
 ``.glb``, ``.usdc``); sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``,
 COLMAP; ``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
 ``dense_points.ply``, ``dense_maps/``, ``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and
-``.glb``, ``video`` and ``path.json``.
+``.glb``, ``video`` and ``path.json``; ``tiles3d/`` of scenes that have a place on the
+earth.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
 from pipeline.io.usd import check_usd
 from pipeline.plan.mesh_voxel import check_mesh_voxel
+from pipeline.plan.placed import check_placed
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
 from pipeline.plan.video_path import check_video_path
@@ -39,6 +41,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config
     reason = ", ".join(config.export.formats) or "no format"
     check_video_path(scan, config.export)
+    check_placed(scan, config)
     if "usd" in config.export.formats:
         check_usd()
     return StagePlan(run=True, reason=reason, decisions=check_mesh_voxel(scan, config))
@@ -124,7 +127,7 @@ def _digest(export: Export) -> str | None:
 def _check_unchanged(job: Job) -> None:
     """Raises: UserError: the file with the video's cameras changed after the run had started."""
     export = job.section(Export)
-    if "video" in export.formats and _digest(export) != job.key["video_path"]:
+    if "video" in export.formats and _digest(export) != job.key.get("video_path"):
         file = export.video.path_file
         raise UserError("changed while the run went on", file=file, fix="start the run again")
 

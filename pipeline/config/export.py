@@ -24,6 +24,7 @@ ExportFormat = Literal[
     "splat",
     "gltf",
     "usd",
+    "tiles3d",
     "points",
     "colmap",
     "colmap_text",
@@ -47,6 +48,8 @@ MASKS_FORMAT: ExportFormat = "masks"
 LOSSY_FORMATS: tuple[ExportFormat, ...] = ("spz", "spz4", "sog", "splat")
 # The loss of larger scenes is not measured: its renders hold all Gaussians several times.
 MAX_MEASURED_LOSSES = 2_000_000
+# The formats that need a scene that GPS or ground control points place on the earth.
+PLACED_FORMATS: frozenset[ExportFormat] = frozenset(("tiles3d",))
 # The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -62,7 +65,8 @@ class Export(Section):
         "seventh of the size), sog_lod (Streamed SOG: a folder of chunks at five levels of detail, "
         "for large scenes on the web), splat (without SH), gltf (.glb with "
         "KHR_gaussian_splatting), usd (.usdc, OpenUSD's ParticleField3DGaussianSplat; needs the "
-        "extra `usd`). "
+        "extra `usd`), tiles3d (3D Tiles 1.1 at the scene's place on the earth, for CesiumJS: a "
+        "folder of tiles at several levels of detail; needs GPS or ground control points). "
         "points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "

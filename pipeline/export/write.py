@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
-from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, Export
+from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, PLACED_FORMATS, Export
 from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.export.selection import Selection, select_gaussians
@@ -18,12 +18,14 @@ from pipeline.io.colmap import write_model
 from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.io.gltf import write_gltf
+from pipeline.io.placement import to_earth
 from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.sog import write_sog
 from pipeline.io.splat import write_splat
 from pipeline.io.splat_losses import losses, unmarked
 from pipeline.io.spz import write_spz
 from pipeline.io.streamed_sog import write_streamed_sog
+from pipeline.io.tiles3d import write_tiles3d
 from pipeline.io.transforms import write_transforms
 from pipeline.io.usd import write_usd
 from pipeline.metrics.protocol import choose_protocol
@@ -40,6 +42,7 @@ from pipeline.scene.views import View, scene_up
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
+from pipeline.splats.skybox import Sky
 
 # The formats of one file with the Gaussians.
 GAUSSIAN_FORMATS = ("ply", *LOSSY_FORMATS, "gltf", "usd")
@@ -149,6 +152,15 @@ class _Files:
     def write_usd(self, path: Path) -> None:
         write_usd(path, self.gaussians, scene_up(self.scene.views, self.scene.manifest))
 
+    def write_tiles3d(self, path: Path) -> None:
+        earth = None if self.scene.georeference is None else to_earth(self.scene.georeference)
+        if earth is not None:
+            # A skybox would hide the scene from outside.
+            centres = np.stack([view.centre for view in self.scene.views])
+            sky = Sky(centres).contains(self.gaussians.source.means[self.gaussians.rows])
+            ground = replace(self.gaussians, rows=self.gaussians.rows[~sky])
+            write_tiles3d(path, ground, earth, antialias=self.antialias)
+
     def write_blocks(self, path: Path) -> None:
         count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
         for number in range(1, count + 1):
@@ -197,6 +209,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
     "usd": ("point_cloud.usdc", lambda path, f: f.write_usd(path)),
+    "tiles3d": ("tiles3d", lambda path, f: f.write_tiles3d(path)),
     "points": ("points.ply", lambda path, f: f.write_points(path)),
     "colmap": ("sparse/0", lambda path, f: write_model(path, f.model)),
     "colmap_text": ("sparse_text", lambda path, f: write_model(path, f.model, text=True)),
@@ -261,6 +274,14 @@ def export_scene(
     if len(measured) < len(lossy):
         report.decisions.append(
             f"what compressed files lose is not measured above {MAX_MEASURED_LOSSES:,} Gaussians"
+        )
+    absent = {name for name in config.formats if name in PLACED_FORMATS} - {
+        name for name, (file, _) in WRITERS.items() if file in written
+    }
+    if absent:
+        report.warnings.append(
+            f"no {', '.join(sorted(absent))}: neither GPS positions nor ground control points "
+            "place the scene on the earth"
         )
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")

@@ -47,14 +47,19 @@ def to_enu(geodetic: Array, origin: Array) -> Array:
     Returns:
         (..., 3) metres east, north and up of ``origin``.
     """
+    away = to_ecef(geodetic) - to_ecef(np.asarray(origin, np.float64))
+    return np.asarray(away @ enu_axes(origin))
+
+
+def enu_axes(origin: Array) -> Array:
+    """(3, 3) east, north and up at (3,) ``origin`` in Earth-centred coordinates, as columns."""
     latitude, longitude = np.radians(origin[0]), np.radians(origin[1])
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
-    axes = np.array(
+    return np.array(
         [
-            [-sin_lon, cos_lon, 0.0],
-            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+            [-sin_lon, -sin_lat * cos_lon, cos_lat * cos_lon],
+            [cos_lon, -sin_lat * sin_lon, cos_lat * sin_lon],
+            [0.0, cos_lat, sin_lat],
         ]
     )
-    return np.asarray((to_ecef(geodetic) - to_ecef(np.asarray(origin, np.float64))) @ axes.T)

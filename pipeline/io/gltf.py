@@ -27,7 +27,7 @@ from pipeline.splats.axes import LUF, Flipped, flip
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.splats.init import SH_C0
 
-_NAME = "KHR_gaussian_splatting"
+GAUSSIAN_SPLATTING = "KHR_gaussian_splatting"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -71,20 +71,14 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
     accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
     sizes = [count * column.width * (1 if column.is_bytes else 4) for column in columns]
     starts = np.cumsum([0, *sizes]).tolist()
-    extension = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
     primitive = {
         "attributes": {column.name: i for i, column in enumerate(columns)},
         "mode": 0,
-        "extensions": {_NAME: extension},
+        "extensions": {GAUSSIAN_SPLATTING: splat_rendering()},
     }
     document = {
         "asset": {"version": "2.0", "generator": "splatmake"},
-        "extensionsUsed": [_NAME],
+        "extensionsUsed": [GAUSSIAN_SPLATTING],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -96,16 +90,37 @@ def write_gltf(path: Path, gaussians: GaussianSource) -> None:
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    size = _HEADER.size + 2 * _CHUNK.size + len(text) + starts[-1]
-    head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
     body = (
         np.asarray(column.values(*chunk), "u1" if column.is_bytes else "<f4").tobytes()
         for column in columns
         for chunk in gaussians.chunks(*column.arrays)
     )
-    write_pieces(path, chain([head, _CHUNK.pack(starts[-1], b"BIN\0")], body))
+    write_pieces(path, chain([_head(document, starts[-1])], body))
+
+
+def splat_rendering() -> dict[str, Any]:
+    """The properties of the extension: how the Gaussians were rendered in training."""
+    return {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+
+
+def glb(document: dict[str, Any], body: bytes) -> bytes:
+    """A .glb file of a document and its buffer."""
+    padding = b"\0" * (-len(body) % 4)
+    return _head(document, len(body) + len(padding)) + body + padding
+
+
+def _head(document: dict[str, Any], body: int) -> bytes:
+    """A .glb file before the ``body`` bytes of its buffer, a multiple of 4."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = _HEADER.size + 2 * _CHUNK.size + len(text) + body
+    start = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
+    return start + _CHUNK.pack(body, b"BIN\0")
 
 
 class _Column(NamedTuple):
@@ -135,11 +150,13 @@ def _columns(sh_degree: int) -> list[_Column]:
     return [
         _Column("POSITION", 3, ("means",), lambda means: means),
         _Column("COLOR_0", 4, ("sh", "opacity_logits"), colour, is_bytes=True),
-        _Column(f"{_NAME}:ROTATION", 4, ("quats",), rotation),
-        _Column(f"{_NAME}:SCALE", 3, ("log_scales",), np.exp),
-        _Column(f"{_NAME}:OPACITY", 1, ("opacity_logits",), lambda x: sigmoid(x)[:, None]),
+        _Column(f"{GAUSSIAN_SPLATTING}:ROTATION", 4, ("quats",), rotation),
+        _Column(f"{GAUSSIAN_SPLATTING}:SCALE", 3, ("log_scales",), np.exp),
+        _Column(
+            f"{GAUSSIAN_SPLATTING}:OPACITY", 1, ("opacity_logits",), lambda x: sigmoid(x)[:, None]
+        ),
         *(
-            _Column(f"{_NAME}:{name}", 3, ("sh",), coefficient(k))
+            _Column(f"{GAUSSIAN_SPLATTING}:{name}", 3, ("sh",), coefficient(k))
             for k, name in enumerate(_COEFFICIENTS[: (sh_degree + 1) ** 2])
         ),
     ]
@@ -160,7 +177,7 @@ def read_gltf(path: Path) -> Gaussians:
             raise ValueError("expected nodes without transforms, found one with a transform")
         primitives = [p for mesh in document.meshes for p in mesh.primitives if p.is_splats]
         if not primitives:
-            raise ValueError(f"expected Gaussians ({_NAME}), found none")
+            raise ValueError(f"expected Gaussians ({GAUSSIAN_SPLATTING}), found none")
         parts: list[Gaussians] = []
         for primitive in primitives:
             parts.append(_gaussians(document, body, primitive.attributes))
@@ -217,7 +234,7 @@ class _Primitive(BaseModel):
 
     @property
     def is_splats(self) -> bool:
-        return _NAME in self.extensions
+        return GAUSSIAN_SPLATTING in self.extensions
 
 
 class _Mesh(BaseModel):
@@ -263,9 +280,12 @@ def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]
             raise ValueError(f"{name}: expected {width} finite numbers for each Gaussian")
         return values
 
-    degree = max((d for d in range(4) if f"{_NAME}:SH_DEGREE_{d}_COEF_0" in attributes), default=0)
+    degree = max(
+        (d for d in range(4) if f"{GAUSSIAN_SPLATTING}:SH_DEGREE_{d}_COEF_0" in attributes),
+        default=0,
+    )
     names = _COEFFICIENTS[: (degree + 1) ** 2]
-    scale = column(f"{_NAME}:SCALE", 3)
+    scale = column(f"{GAUSSIAN_SPLATTING}:SCALE", 3)
     if scale.min() < 0:
         log_scales = scale  # Drafts of the extension stored logarithms.
     else:
@@ -274,10 +294,10 @@ def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]
     arrays: dict[str, NDArray[Any]] = {
         "means": column("POSITION", 3),
         "log_scales": log_scales,
-        "quats": column(f"{_NAME}:ROTATION", 4)[:, [3, 0, 1, 2]],
-        "opacity_logits": logit(column(f"{_NAME}:OPACITY", 1)[:, 0], _OPACITY_MARGIN),
+        "quats": column(f"{GAUSSIAN_SPLATTING}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        "opacity_logits": logit(column(f"{GAUSSIAN_SPLATTING}:OPACITY", 1)[:, 0], _OPACITY_MARGIN),
     }
-    coefficients = [column(f"{_NAME}:{name}", 3) for name in names]
+    coefficients = [column(f"{GAUSSIAN_SPLATTING}:{name}", 3) for name in names]
     if any(len(values) != len(scale) for values in (*arrays.values(), *coefficients)):
         raise ValueError("expected attributes of one length, found several")
     return Gaussians.from_arrays(flip(arrays | {"sh": np.stack(coefficients, 1)}, LUF))

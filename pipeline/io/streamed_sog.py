@@ -17,22 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.io.sog import write_sog
 from pipeline.io.sog_container import META, Asset
 from pipeline.runtime.atomic import write_text
 from pipeline.runtime.json_file import JsonObject, Vector3
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
+from pipeline.splats.chunks import LEAF, Rows, box, halves, in_z_order
 from pipeline.splats.levels import halved
-from pipeline.splats.z_order import z_order
-
-Rows = NDArray[np.intp]
 
 LOD_META = "lod-meta.json"
 #: The number of levels of detail; each has half of the Gaussians of the one before.
 LEVELS = 5
-#: The largest number of Gaussians of a leaf.
-LEAF = 1 << 17
 
 
 class Bound(JsonObject):
@@ -108,7 +103,7 @@ def _write_node(
     folder: Path, gaussians: GaussianRows, rows: Rows, written: _Written, antialias: bool
 ) -> Node:
     if len(rows) > LEAF:
-        parts = _halves(gaussians.source.means, rows)
+        parts = halves(gaussians.source.means, rows)
         first, second = (_write_node(folder, gaussians, p, written, antialias) for p in parts)
         bounds = np.array([[node.bound.min, node.bound.max] for node in (first, second)])
         bound = _bound(bounds[:, 0].min(0), bounds[:, 1].max(0))
@@ -118,9 +113,8 @@ def _write_node(
     for level, made in enumerate(_levels(collect(replace(gaussians, rows=rows)))):
         name = f"{level}_{number}/{META}"
         write_sog(folder / name, made, antialias=antialias)
-        reach = _reach(made)
-        low = np.minimum(low, (made.means - reach).min(0))
-        high = np.maximum(high, (made.means + reach).max(0))
+        corners = box(made, 1.0)
+        low, high = np.minimum(low, corners[0]), np.maximum(high, corners[1])
         lods[str(level)] = Part(file=len(written.filenames), offset=0, count=len(made))
         written.filenames.append(name)
         written.counts[level] += len(made)
@@ -132,28 +126,8 @@ def _levels(gaussians: GaussianArrays) -> Iterator[GaussianArrays]:
     for level in range(LEVELS):
         if level:
             gaussians = halved(gaussians)
-        order = z_order(gaussians.means)
-        gaussians = GaussianArrays(**{n: values[order] for n, values in gaussians.arrays().items()})
+        gaussians = in_z_order(gaussians)
         yield gaussians
-
-
-def _halves(means: NDArray[np.float32], rows: Rows) -> tuple[Rows, Rows]:
-    """The rows on both sides of the median along the longest axis."""
-    found = means[rows]
-    axis = int((found.max(0) - found.min(0)).argmax())
-    order = np.argsort(found[:, axis], kind="stable")
-    middle = len(rows) // 2
-    return rows[order[:middle]], rows[order[middle:]]
-
-
-def _reach(gaussians: GaussianArrays) -> NDArray[np.float64]:
-    """(N, 3) extents of the Gaussians' boxes of one standard deviation along the world's axes."""
-    quats = gaussians.quats.astype(np.float64)
-    quats[(quats == 0).all(1)] = (1, 0, 0, 0)
-    axes = np.abs(quat_to_rotation(quats))
-    scales = np.exp(gaussians.log_scales.astype(np.float64))
-    found: NDArray[np.float64] = np.einsum("nij,nj->ni", axes, scales)
-    return found
 
 
 def _bound(low: NDArray[np.float64], high: NDArray[np.float64]) -> Bound:

@@ -125,6 +125,14 @@ def test_exports_reserve_what_they_take(scene: Scene) -> None:
             assert used <= memory_mb("export", plan_of(scene, config), 2) <= 1.5 * used, formats
 
 
+@pytest.mark.parametrize(("gaussians", "used"), [(131_072, 350), (300_000, 354)])
+def test_levels_of_detail_reserve_what_the_largest_chunk_takes(gaussians: int, used: int) -> None:
+    scene = Scene(20, (640, 480), (640, 480), gaussians)
+    for name in ("sog_lod", "tiles3d"):
+        config = Config.model_validate({"export": {"formats": [name]}})
+        assert used <= memory_mb("export", plan_of(scene, config), 2) <= 1.5 * used, name
+
+
 def test_jobs_that_estimate_depth_maps_reserve_what_they_take() -> None:
     """With one thread; 28 of 32 and 21 of 25 photographs are training views."""
     config = Config.model_validate({"preset": "fast", "init": {"method": "dense"}})

@@ -19,6 +19,7 @@ from benchmarks.results import (
     GEOREFERENCE_VERDICTS,
     BlocksResult,
     BudgetResult,
+    FileResult,
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
@@ -243,6 +244,18 @@ def verdicts_table(found: Sequence[GeoreferenceResult]) -> str:
     return markdown.table(rows)
 
 
+def files_table(found: Sequence[FileResult]) -> str:
+    """A row for each file; sizes are also those of a Gaussian."""
+    rows = [["scene", "Gaussians", "SH degree", "format", "written by"]]
+    rows[0] += ["size (MB)", "bytes a Gaussian", "against PLY (dB)", "CPU (s)"]
+    for r in found:
+        counts = [f"{r.gaussians:,}", str(r.sh_degree)]
+        sizes = [f"{r.size_mb:.2f}", f"{1e6 * r.size_mb / r.gaussians:.1f}"]
+        loss = "equal" if r.psnr >= 100 else f"{r.psnr:.1f}"
+        rows.append([r.scene, *counts, r.format, r.writer, *sizes, loss, cell(r.cpu_s, ".1f")])
+    return markdown.table(rows)
+
+
 def slurm_table(found: Sequence[SlurmResult]) -> str:
     rows = [["scene", "nodes", "blocks", "jobs"]]
     rows[0] += ["wall (s)", "a job runs (s)", "none runs (s)", "training of blocks (s)"]
@@ -271,6 +284,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),
     "slurm": (SlurmResult, slurm_table),
+    "files": (FileResult, files_table),
 }
 
 

@@ -33,6 +33,30 @@ class GeoreferenceResult:
     errors: tuple[float, float, float, float] | None
 
 
+# ---- benchmarks.files ----
+
+
+@dataclass(frozen=True)
+class FileResult:
+    """A file of the Gaussians of a scene.
+
+    Attributes:
+        writer: The program that wrote it.
+        size_mb: Millions of bytes.
+        psnr: Of its renders against those of the PLY file, dB; 100 for equal pictures.
+        cpu_s: The processor time of writing it; None for files of other programs.
+    """
+
+    scene: str
+    gaussians: int
+    sh_degree: int
+    format: str
+    writer: str
+    size_mb: float
+    psnr: float
+    cpu_s: float | None
+
+
 # ---- benchmarks.novel_views ----
 
 

@@ -1,8 +1,7 @@
 """``python -m benchmarks.files results/NAME``: size, loss and time of each format of Gaussians.
 
 Writes the exported Gaussians of finished scenes in each format, of SH degree 0 and of their own,
-and renders up to four of their test views from each file as it is read, against renders of the PLY
-file. ``--other FILE`` measures a file that another program wrote of the last scene's PLY file.
+and renders four of their views from each file as it is read, against renders of the PLY file. ``--other FILE`` measures a file that another program wrote of the last scene's PLY file.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,15 +16,17 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.record_tables import files_table
 from benchmarks.results import FileResult
 from pipeline.export.losses import measure_losses
+from pipeline.io.camera_files import read_cameras
 from pipeline.io.frame_json import Frame
 from pipeline.io.splat_files import read_gaussians, write_gaussians
 from pipeline.render import RasterOptions
-from pipeline.scene.views import View
+from pipeline.scene.views import camera_views
 from pipeline.splats.arrays import GaussianArrays
-from splatmake import load
 
 FORMATS = {"ply": ".ply", "spz": ".spz", "spz4": ".spz", "sog": ".sog", "splat": ".splat"}
 OURS = "splatmake"
+# The longer side of the renders, pixels.
+SIDE = 640
 
 
 class Bench:
@@ -44,7 +44,8 @@ class Bench:
         self.options = RasterOptions(
             background=frame.background, near=frame.near, antialias=frame.antialias
         )
-        self.views: Sequence[View] = load(folder).test_views
+        cameras = read_cameras(folder / "export" / "transforms.json", exported=True)
+        self.views = camera_views(cameras, SIDE)
 
     def written(self, name: str, sh_degree: int, folder: Path) -> FileResult:
         """A format, measured."""

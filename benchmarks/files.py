@@ -1,7 +1,8 @@
 """``python -m benchmarks.files results/NAME``: size, loss and time of each format of Gaussians.
 
 Writes the exported Gaussians of finished scenes in each format, of SH degree 0 and of their own,
-and renders four of their views from each file as it is read, against renders of the PLY file. ``--other FILE`` measures a file that another program wrote of the last scene's PLY file.
+and renders four of their views from each file as it is read, against renders of the PLY file.
+``--other FILE`` measures a file that another program wrote of the last scene's PLY file.
 """
 
 from __future__ import annotations

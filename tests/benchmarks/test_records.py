@@ -15,6 +15,7 @@ from benchmarks.measured import Record, command_line, measured, write_record
 from benchmarks.results import (
     BlocksResult,
     BudgetResult,
+    FileResult,
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
@@ -33,6 +34,19 @@ from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
 
 EXAMPLES: dict[str, tuple[Any, str]] = {
+    "files": (
+        FileResult(
+            scene="fox",
+            gaussians=20_000,
+            sh_degree=3,
+            format="sog",
+            writer="splatmake",
+            size_mb=0.9,
+            psnr=46.25,
+            cpu_s=1.5,
+        ),
+        "| fox | 20,000 | 3 | sog | splatmake | 0.90 | 45.0 | 46.2 | 1.5 |",
+    ),
     "blocks": (
         BlocksResult(
             run="town@fast",

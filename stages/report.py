@@ -37,7 +37,6 @@ def work(job: Job) -> None:
     from pipeline.reporting.metrics import read_runs, with_times
     from pipeline.reporting.page import write_report
     from pipeline.reporting.scene import read_results
-    from pipeline.scene.georeference import Georeference
 
     start = time.perf_counter()
     views, train = inputs.trained_views(job), inputs.drawing(job)
@@ -51,6 +50,7 @@ def work(job: Job) -> None:
     metrics.write(job.out)
     runs = read_runs(metrics, results, without=job.stage) | {job.stage: own}
     protocol = choose_protocol(views, job.section(Split), train)
+    frame = inputs.georeference(job)
     trained = TrainedScene(
         gaussians=inputs.filled_arrays(job),
         views=views,
@@ -58,7 +58,9 @@ def work(job: Job) -> None:
         background=protocol.background,
         antialias=train.antialias,
         near=protocol.near,
-        normalization=Georeference.normalization_of(job.inputs["poses"]),
+        normalization=inputs.normalization(job),
+        is_metric=frame is not None and frame.is_metric,
+        up=None if frame is None else frame.up,
     )
     timed = with_times(metrics, runs)
     judgement = None

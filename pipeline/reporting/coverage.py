@@ -147,7 +147,8 @@ def _error_rows(error: ErrorByTrust) -> list[tuple[str, str]]:
 def _above(viewpoints: Sequence[ProposedViewpoint], scene: TrainedScene) -> Above | None:
     if not scene.views or not viewpoints:
         return None
-    frame = upright_frame(np.stack([view.world_to_camera[:3, :3] for view in scene.views]))
+    rotations = np.stack([view.world_to_camera[:3, :3] for view in scene.views])
+    frame = upright_frame(rotations, scene.up)
     plan = frame[[0, 2]]
     cameras = np.stack([view.centre for view in scene.views]) @ plan.T
     positions = np.array([v.position for v in viewpoints])

@@ -60,6 +60,8 @@ class TrainedScene:
         antialias, near: The options of the training.
         normalization: The similarity from the world of the given poses, which positions of
             proposed viewpoints refer to, to that of the views.
+        is_metric: Whether the unit of the given world is the metre.
+        up: (3,) the unit vector upwards in the world; None if only the cameras tell it.
     """
 
     gaussians: GaussianArrays
@@ -69,6 +71,8 @@ class TrainedScene:
     antialias: bool
     near: float
     normalization: Normalization = IDENTITY
+    is_metric: bool = False
+    up: NDArray[np.float64] | None = None
 
 
 class BlockRun(NamedTuple):

@@ -105,6 +105,7 @@ def sized_for_spz(results: SceneResults) -> SceneResults:
         gaussians=scene.gaussians.scaled(1 / radius),
         views=views,
         near=scene.near / radius,
+        normalization=replace(scene.normalization, scale=scene.normalization.scale / radius),
     )
     return replace(results, trained=trained, points=replace(points, xyz=points.xyz / radius))
 
@@ -125,7 +126,8 @@ def _shown(whole: GaussianArrays, packed: Packed) -> str:
 def viewer_data(results: SceneResults) -> dict[str, Any]:
     """Input of the viewer besides the Gaussians.
 
-    The frame of the page has y up; its unit box contains the scene.
+    The frame of the page has y up, as the world if its up direction is known; its unit box contains
+    the scene.
 
     Returns:
         ``frame``: 16 numbers, world to the page's frame, column by column; ``near`` (world unit),
@@ -133,8 +135,10 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
         pixels, in display orientation, with ``world_to_camera`` (3, 4) row by row; ``start``: index
         of the initial camera, or null; ``points``: base64 of int16 (P, 3), little-endian, in
         the page's frame in units of ``step``; ``colours``: base64 of uint8 (P, 3); ``size`` of a
-        camera; ``depths``: ``codes``, base64 of the ``depth_codes`` of each camera, ``rows`` and
-        ``columns``, and ``first`` (the page's unit) and ``ratio``, which decode them.
+        camera; ``unit``: ``name`` of the unit of the exported Gaussians, and ``scale``, the number
+        of them in one unit of the world; ``depths``: ``codes``, base64 of the ``depth_codes`` of
+        each camera, ``rows`` and ``columns``, and ``first`` (the page's unit) and ``ratio``, which
+        decode them.
     """
     scene, points = results.trained, results.points
     cameras = [upright_camera(v, scene.orientations.get(v.name, 1)) for v in scene.views]
@@ -144,7 +148,7 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
     xyz, rgb = points.xyz[finite], points.rgb[finite]
     depths = coarse_depths(scene.gaussians, cameras, scene.near)
     middle, radius = _robust_box(xyz, centres)
-    rotation = upright_frame(poses[:, :, :3])
+    rotation = upright_frame(poses[:, :, :3], scene.up)
     frame = np.eye(4)
     frame[:3, :3] = rotation / radius
     frame[:3, 3] = -rotation @ middle / radius
@@ -166,6 +170,10 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
         "step": _STEP,
         "colours": _base64(np.ascontiguousarray(rgb, np.uint8).tobytes()),
         "size": _camera_size(centres / radius),
+        "unit": {
+            "name": "m" if scene.is_metric else "scene units",
+            "scale": 1 / scene.normalization.scale,
+        },
         "depths": {
             "rows": ROWS,
             "columns": COLUMNS,
@@ -223,20 +231,29 @@ def _robust_box(xyz: Array, centres: Array) -> tuple[Array, float]:
     return middle, radius if radius > 0 else 1.0
 
 
-def upright_frame(rotations: Array) -> Array:
-    """(3, 3) rotation from the world to a frame with y up: the mean up direction of the cameras or,
-    if these cancel (aerial images), the mean direction opposite to their viewing direction."""
-    up = np.array([0.0, -1.0, 0.0])
-    for row in (1, 2):
-        mean = -rotations[:, row].mean(axis=0) if len(rotations) else np.zeros(3)
-        length = float(np.linalg.norm(mean))
-        if length > 0.3:
-            up = mean / length
-            break
+def upright_frame(rotations: Array, up: Array | None = None) -> Array:
+    """(3, 3) rotation from the world to a frame with y up.
+
+    Args:
+        rotations: (C, 3, 3) world to camera.
+        up: (3,) the world's unit vector upwards; None to estimate it from the cameras.
+    """
+    up = _up_of_cameras(rotations) if up is None else up
     other = np.eye(3)[np.argmin(np.abs(up))]
     z = np.cross(other, up)
     z /= np.linalg.norm(z)
     return np.stack([np.cross(up, z), up, z])
+
+
+def _up_of_cameras(rotations: Array) -> Array:
+    """(3,) mean up direction of the cameras or, if these cancel (aerial images), the mean direction
+    opposite to their viewing direction."""
+    for row in (1, 2):
+        mean = -rotations[:, row].mean(axis=0) if len(rotations) else np.zeros(3)
+        length = float(np.linalg.norm(mean))
+        if length > 0.3:
+            return np.asarray(mean / length)
+    return np.array([0.0, -1.0, 0.0])
 
 
 def _camera_size(centres: Array) -> float:

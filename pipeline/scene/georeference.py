@@ -138,6 +138,13 @@ class Georeference(JsonFile, GeoreferenceSummary):
         return self.method in ("gcp", "gps")
 
     @property
+    def up(self) -> NDArray[np.float64] | None:
+        """(3,) the unit vector upwards; None for given poses, whose world may have any."""
+        if self.method == "given":
+            return None
+        return np.array([0.0, -1.0, 0.0] if self.method == "level" else [0.0, 0.0, 1.0])
+
+    @property
     def normalization(self) -> Normalization:
         """From the given world to the scene's; the identity unless ``method`` is "given"."""
         if self.method != "given" or not isinstance(self.origin, CartesianOrigin):

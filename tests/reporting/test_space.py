@@ -24,6 +24,7 @@ from pipeline.reporting.space import (
     viewer_data,
     viewer_script,
 )
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.axes import RUB, Flipped
@@ -92,6 +93,17 @@ def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
         np.testing.assert_allclose(ours.centre, scale * view.centre, atol=1e-6)
     np.testing.assert_allclose(made.points.xyz, scale * points, rtol=1e-6)
     assert sized_for_spz(made) is made
+
+
+@pytest.mark.parametrize(("method", "up"), [("gps", (0, 0, 1)), ("level", (0, -1, 0))])
+def test_the_up_direction_of_a_georeference_is_the_pages(method: str, up: tuple[int, ...]) -> None:
+    """Whatever direction the cameras have."""
+    known = Georeference.model_construct(method=method).up
+    scene = trained(views=tilted(ring(12), rotation(1)), up=known)
+    frame = np.array(viewer_data(report(trained=scene))["frame"]).reshape(4, 4).T
+    turned = frame[:3, :3] @ up
+    np.testing.assert_allclose(turned / np.linalg.norm(turned), [0, 1, 0], atol=1e-9)
+    assert Georeference.model_construct(method="given").up is None
 
 
 def test_aerial_images_up_is_opposite_to_the_viewing_direction() -> None:

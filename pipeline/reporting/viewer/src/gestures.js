@@ -6,8 +6,8 @@ const DOUBLE_MS = 350;
 const TURN = Math.PI; // radians for a drag across the canvas' height
 
 export class Gestures {
-  // `act` has rotate, zoom, pan, ended, click, focus, step, reset, changed (active or not) and
-  // ignored (a wheel that scrolled the page).
+  // `act` has rotate, zoom, pan, ended, click, enter (the key), focus, step, reset, changed (active
+  // or not) and ignored (a wheel that scrolled the page).
   constructor(box, canvas, act) {
     Object.assign(this, { box, canvas, act, active: false, pointers: new Map(), last: null });
     canvas.addEventListener("pointerdown", event => this.#down(event));
@@ -101,6 +101,7 @@ export class Gestures {
       ArrowUp: () => this.act.zoom(1 / 1.1), ArrowDown: () => this.act.zoom(1.1),
       "+": () => this.act.zoom(1 / 1.1), "=": () => this.act.zoom(1 / 1.1),
       "-": () => this.act.zoom(1.1), Home: () => this.act.reset(), 0: () => this.act.reset(),
+      Enter: () => this.act.enter(),
     };
     if (event.shiftKey && turns[event.key]) this.act.rotate(...turns[event.key]);
     else if (keys[event.key]) keys[event.key]();

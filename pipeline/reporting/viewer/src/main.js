@@ -27,6 +27,7 @@ import { Comparison, place } from "./compare.js";
 import { Frusta } from "./frusta.js";
 import { Gestures } from "./gestures.js";
 import { Coverage } from "./limits.js";
+import { Measure } from "./measure.js";
 import { Orbit } from "./orbit.js";
 import { bytes, poseInPage, Stage } from "./stage.js";
 
@@ -34,6 +35,7 @@ const OVERVIEW = { width: 100, height: 100, fx: 107, fy: 107, cx: 50, cy: 50 }; 
 const CROP = 1.4; // an image of another shape than the canvas is enlarged by this at most
 const FADE_OUT = [0.05, 0.4]; // distances from the hull at which far content starts and ends fading
 const FOCUS_SHARE = 0.7; // of the distance, after a double click
+const PIVOT_REACH = 2; // one orbits points within this multiple of the scene's reach
 const HINT_MS = 1800;
 
 const box = document.getElementById("space");
@@ -68,7 +70,9 @@ function start(data) {
   const frusta = new Frusta(cameras, data.size, getComputedStyle(box));
   const comparison = new Comparison(box);
   frusta.visible = tools.elements.cameras.checked;
-  stage.scene.add(frusta);
+  const measure = new Measure(
+    box.querySelector(".measured"), data.unit.scale / frame.getMaxScaleOnAxis(), data.unit.name);
+  stage.scene.add(frusta, measure);
   let lens = OVERVIEW; // the pinhole whose image fills the canvas
   let current = null; // the index of the camera that was shown last, or null for the overview
 
@@ -162,23 +166,42 @@ function start(data) {
   }
 
   function ended() {
-    if (orbit.panned) orbit.recentre(stage.surface(0, 0, 0.15));
+    if (orbit.panned) orbit.recentre(stage.surface(0, 0, 0.15, PIVOT_REACH * coverage.reach));
     frusta.draw(stage.camera.position);
     stage.redraw();
   }
 
   const device = (x, y) => [2 * x / canvas.clientWidth - 1, 1 - 2 * y / canvas.clientHeight];
+
+  function setMeasuring(active) {
+    measure.activate(active);
+    button.measure.setAttribute("aria-pressed", active);
+    box.classList.toggle("measuring", active);
+    stage.redraw();
+    if (active) gestures.activate(true);
+  }
+
+  function measureAt(x, y) {
+    measure.choose(stage.surface(...device(x, y), 2 / canvas.clientHeight));
+    stage.redraw();
+  }
+
   const gestures = new Gestures(box, canvas, {
     rotate: (x, y) => orbit.rotate(x, y),
     zoom: factor => orbit.zoom(factor),
     pan: (x, y) => orbit.pan(x, y),
     step, reset, ended,
+    enter() {
+      if (measure.active) measureAt(canvas.clientWidth / 2, canvas.clientHeight / 2);
+    },
     click(x, y) {
+      if (measure.active) return measureAt(x, y);
       const found = frusta.at(x, y, stage.camera, canvas);
       if (found) showCamera(found.index, true);
     },
     focus(x, y) {
-      const point = stage.surface(...device(x, y), 0.01);
+      if (measure.active) return measureAt(x, y);
+      const point = stage.surface(...device(x, y), 0.01, PIVOT_REACH * coverage.reach);
       if (point) orbit.focus(point, FOCUS_SHARE, true);
     },
     changed(active) {
@@ -195,7 +218,7 @@ function start(data) {
 
   canvas.addEventListener("pointermove", event => {
     const { left, top } = canvas.getBoundingClientRect();
-    const found = event.buttons || event.pointerType === "touch" ? null
+    const found = event.buttons || event.pointerType === "touch" || measure.active ? null
       : frusta.at(event.clientX - left, event.clientY - top, stage.camera, canvas);
     label.textContent = found ? cameras[found.index].name : "";
     canvas.style.cursor = found ? "pointer" : "";
@@ -208,6 +231,13 @@ function start(data) {
   button.release.addEventListener("click", () => {
     gestures.activate(false);
     canvas.blur();
+  });
+  button.measure.addEventListener("click", () => {
+    setMeasuring(!measure.active);
+    if (measure.active) canvas.focus({ preventScroll: true });
+  });
+  box.addEventListener("keydown", event => {
+    if (event.key === "Escape") setMeasuring(false);
   });
   button.full.hidden = !box.requestFullscreen;
   button.full.addEventListener("click", () =>
@@ -249,7 +279,7 @@ function start(data) {
     return {
       pose: camera.matrixWorld.toArray(), pivot: orbit.pivot.toArray(), fov: camera.fov, aspect: camera.aspect,
       near: camera.near, fade: stage.fade.value, active: gestures.active, current,
-      photograph: comparison.camera?.name ?? null,
+      photograph: comparison.camera?.name ?? null, lengths: measure.lengths,
     };
   }
 

@@ -4,6 +4,7 @@ import * as THREE from "three";
 import { dyno, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 import { projectAsRasterizer } from "./projection.js";
+import { Surface } from "./surface.js";
 
 const FAR = 1e4;
 // Gaussians fade between these multiples of the scene's reach when the viewpoint leaves its hull.
@@ -50,7 +51,6 @@ export class Stage {
     this.splats = new SplatMesh({
       fileBytes: bytes(document.getElementById("splats").textContent),
       extSplats: true,
-      minRaycastOpacity: 0.3,
     });
     frame.decompose(this.splats.position, this.splats.quaternion, this.splats.scale);
     this.#fadeOutside();
@@ -98,21 +98,25 @@ export class Stage {
     this.redraw();
   }
 
-  // The median distance of the surface along nine rays around a position on the canvas, in
-  // normalised device coordinates, `spread` apart; null if less than half of them hit the scene.
-  surface(x, y, spread) {
-    const rays = new THREE.Raycaster(), depths = [];
-    for (const i of [-1, 0, 1])
-      for (const j of [-1, 0, 1]) {
-        rays.setFromCamera(new THREE.Vector2(x + i * spread, y + j * spread), this.camera);
-        const [hit] = rays.intersectObject(this.splats);
-        if (hit && hit.point.distanceTo(this.coverage.centre) < 2 * this.coverage.reach)
-          depths.push(hit.distance);
-      }
+  // The point of the surface at a position on the canvas, in normalised device coordinates: at the
+  // median distance along nine rays around it, `spread` apart. null if less than half of them meet
+  // the surface, or if it is farther than `reach` from the scene's centre.
+  surface(x, y, spread, reach = Infinity) {
+    const { camera, coverage, near } = this;
+    this.seen ??= new Surface(this.splats);
+    this.splats.updateMatrixWorld();
+    const steps = [[0, 0], [-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
+    const rays = steps.map(([i, j]) => {
+      const caster = new THREE.Raycaster();
+      caster.setFromCamera(new THREE.Vector2(x + i * spread, y + j * spread), camera);
+      return caster.ray;
+    });
+    const pixel = 2 * Math.tan(THREE.MathUtils.degToRad(camera.fov / 2)) / this.canvas.clientHeight;
+    const depths = this.seen.depths(rays, near, pixel, () => true).filter(depth => depth !== null);
     if (depths.length < 5) return null;
     depths.sort((a, b) => a - b);
-    rays.setFromCamera(new THREE.Vector2(x, y), this.camera);
-    return rays.ray.at(depths[depths.length >> 1], new THREE.Vector3());
+    const point = rays[0].at(depths[depths.length >> 1], new THREE.Vector3());
+    return point.distanceTo(coverage.centre) < reach ? point : null;
   }
 
   // Wait until the splats are coloured and sorted for this camera.

@@ -36,7 +36,6 @@ from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View, camera_views, scene_extent
-from pipeline.splats.arrays import GaussianRows, collect
 from pipeline.splats.reduce import reduce_gaussians
 
 # Longer side of the views that decide which Gaussians are converted, pixels.
@@ -137,7 +136,7 @@ def convert(
             antialias=bool(antialias), near=near_plane(scene_extent(views)) if views else 0.01
         )
         chosen = select_gaussians(arrays, wanted.max_gaussians, region, views, options)
-        arrays = collect(GaussianRows(arrays, chosen.rows, arrays.sh_degree))
+        arrays = chosen.gaussians
         said = [f"{source}: {text}" for text in chosen.decisions]
     made = reduce_gaussians(arrays, sh_degree, min_opacity, morton_order)
     warnings += write_gaussians(target, made, antialias=antialias, spz_version=spz_version)

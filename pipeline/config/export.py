@@ -77,8 +77,8 @@ class Export(Section):
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     max_gaussians: GaussianCount | None = Field(
         None,
-        description="The largest number of exported Gaussians: those that show most of the "
-        "training views, by the sum of alpha times transmittance. null: all.",
+        description="The largest number of exported Gaussians. Pairs are merged where the training "
+        "views show least of them, by the sum of alpha times transmittance. null: no limit.",
     )
     region: Literal["subject"] | Box | None = Field(
         None,

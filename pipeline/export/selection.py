@@ -1,4 +1,5 @@
-"""Which Gaussians of a finished scene are exported: those of a region, and those that show most."""
+"""Which Gaussians of a finished scene are exported: those of a region, merged where views show it
+least."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.runtime.text import counted
 from pipeline.scene.views import View, evenly_spaced
-from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
+from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect, joined
+from pipeline.splats.levels import merged_to
 
 Rows = NDArray[np.intp]
 Region = Literal["subject"] | Box | None
@@ -36,16 +38,18 @@ COST_VIEWS = 20
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen Gaussians.
+    """The Gaussians to export.
 
     Attributes:
-        rows: (M,) indices, ascending.
+        gaussians: The Gaussians; invented ones are the last.
+        num_invented: The number of invented ones.
         psnr: The mean PSNR of renders against those of all Gaussians, dB, over the pixels that the
             region shows; None where nothing was left out, or no view shows the region.
         decisions: What was chosen and what it costs, sentences.
     """
 
-    rows: Rows
+    gaussians: GaussianArrays
+    num_invented: int = 0
     psnr: float | None = None
     decisions: list[str] = field(default_factory=list)
 
@@ -58,11 +62,11 @@ def select_gaussians(
     options: RasterOptions,
     num_invented: int = 0,
 ) -> Selection:
-    """Choose Gaussians by region, then by how much of the views they show.
+    """Choose Gaussians by region, then merge them to a number.
 
     Args:
         gaussians: All Gaussians of the scene; invented ones are the last.
-        max_gaussians: The largest number of chosen ones; None for no limit. Invented ones, which no
+        max_gaussians: The largest number of Gaussians; None for no limit. Invented ones, which no
             view shows, count and stay.
         region: A box (x0, y0, z0, x1, y1, z1) in the frame of the Gaussians, "subject" for a box
             around what the cameras look at, or None for everything.
@@ -84,30 +88,43 @@ def select_gaussians(
         sides = " to ".join(", ".join(f"{value:.4g}" for value in box[i : i + 3]) for i in (0, 3))
         name = "the subject" if region == "subject" else "the region"
         decisions.append(f"{name}, {sides}, has {counted(len(rows), 'Gaussian')}")
+    invented = int((rows >= len(gaussians) - num_invented).sum())
+    chosen = _chosen(gaussians, rows)
     if max_gaussians is not None and len(rows) > max_gaussians:
-        invented = int((rows >= len(gaussians) - num_invented).sum())
         if invented >= max_gaussians:
             raise UserError(
                 f"export.max_gaussians: expected more than the {invented} invented Gaussians, "
                 f"found {max_gaussians}",
                 fix="raise export.max_gaussians, or set holes.fill: none",
             )
-        trained = rows[: len(rows) - invented]
-        weights = contributions_to(_chosen(gaussians, trained), views, options)
-        kept = np.sort(np.argsort(-weights, kind="stable")[: max_gaussians - invented])
-        share = weights[kept].sum() / max(weights.sum(), np.finfo(float).tiny)
-        decisions.append(
-            f"{counted(max_gaussians, 'Gaussian')} of {len(rows):,}, which show {share:.2%} of the "
-            "training views"
+        count = len(rows) - invented
+        trained, sentence = _reduced(
+            _chosen(chosen, np.arange(count)), max_gaussians - invented, views, options
         )
-        rows = np.concatenate([trained[kept], rows[len(trained) :]])
-    if len(rows) == len(gaussians) or not views:
-        return Selection(rows, decisions=decisions)
-    cost = psnr_against_all(gaussians, rows, views, options, region is not None)
+        decisions.append(sentence)
+        chosen = joined([trained, _chosen(chosen, np.arange(count, len(rows)))])
+    if len(chosen) == len(gaussians) or not views:
+        return Selection(chosen, invented, decisions=decisions)
+    shown = None if region is None else rows
+    cost = psnr_against_all(gaussians, chosen, views, options, shown)
     if cost is not None:
         where = "where they show the region" if region is not None else "of the whole scene"
         decisions.append(f"PSNR {cost:.2f} dB against renders {where}")
-    return Selection(rows, cost, decisions)
+    return Selection(chosen, invented, cost, decisions)
+
+
+def _reduced(
+    gaussians: GaussianArrays, count: int, views: Sequence[View], options: RasterOptions
+) -> tuple[GaussianArrays, str]:
+    """``count`` Gaussians that look like all of them from the training views, and a sentence:
+    without those that no view shows, merged in pairs where the views show least."""
+    weights = contributions_to(gaussians, views, options)
+    kept = np.sort(np.argsort(-weights, kind="stable")[: max(count, (weights > 0).sum())])
+    made = merged_to(_chosen(gaussians, kept), count, weights[kept])
+    unseen, merged = len(gaussians) - len(kept), len(kept) - len(made)
+    parts = [f"{unseen:,} that no training view shows left out"] * (unseen > 0)
+    parts += [f"{merged:,} merged into neighbours"] * (merged > 0)
+    return made, f"{counted(len(made), 'Gaussian')} of {len(gaussians):,}: {', '.join(parts)}"
 
 
 def in_box(means: NDArray[np.float32], box: Box) -> NDArray[np.bool_]:
@@ -165,30 +182,31 @@ def contributions_to(
 
 def psnr_against_all(
     gaussians: GaussianArrays,
-    rows: Rows,
+    chosen: GaussianArrays,
     views: Sequence[View],
     options: RasterOptions,
-    masked: bool,
+    region: Rows | None = None,
 ) -> float | None:
-    """Mean PSNR of renders of some Gaussians against those of all, in dB, over test views, or over
+    """Mean PSNR of renders of other Gaussians against those of all, in dB, over test views, or over
     all views without any.
 
     Args:
-        masked: Whether only pixels count that show the region, by ``REGION_SHARE``.
+        region: The rows of ``gaussians`` in the region: only pixels count that show it, by
+            ``REGION_SHARE``. None: all pixels count.
     """
     from pipeline.metrics.image import psnr
     from pipeline.render.views import render_rgb, to_bytes
     from pipeline.splats.gaussians import Gaussians
     from pipeline.splats.init import SH_C0
 
-    everything, some = Gaussians.sharing(gaussians), Gaussians.sharing(_chosen(gaussians, rows))
+    everything, some = Gaussians.sharing(gaussians), Gaussians.sharing(chosen)
     marked = np.full((len(gaussians), 1, 3), -0.5 / SH_C0, np.float32)  # black
-    marked[rows] *= -1  # white
+    marked[slice(0) if region is None else region] *= -1  # white
     shares = Gaussians.sharing(replace(gaussians, sh=marked))
     found = []
     for view in evenly_spaced([view for view in views if view.is_test] or list(views), COST_VIEWS):
         mask = None
-        if masked:
+        if region is not None:
             mask = (
                 render_rgb(shares, view, replace(options, background=None))[:, :, 0] > REGION_SHARE
             )

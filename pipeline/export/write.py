@@ -39,7 +39,7 @@ from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.unrounded import Unrounded
 from pipeline.scene.views import View, scene_up
-from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
+from pipeline.splats.arrays import GaussianArrays, GaussianRows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 from pipeline.splats.skybox import Sky
@@ -241,7 +241,8 @@ def export_scene(
     means = scene.gaussians.means
     normalization, scene = scene.normalization, _in_given_unit(scene)
     scene, selection = _selected(scene, config, train, split, threads)
-    means = means[selection.rows]
+    if len(selection.gaussians) < len(means):
+        means = (selection.gaussians.means * normalization.scale).astype(np.float32)
     gaussians = reduce_gaussians(
         scene.gaussians,
         config.sh_degree,
@@ -297,14 +298,12 @@ def _selected(
     """The scene with the Gaussians that ``export.region`` and ``export.max_gaussians`` leave."""
     views, count = scene.training_size_views, len(scene.gaussians)
     if config.region is None and (config.max_gaussians or count) >= count:
-        return scene, Selection(np.arange(count))
+        return scene, Selection(scene.gaussians, scene.num_invented)
     options = choose_protocol(views, split, train).options(train, threads)
     found = select_gaussians(
         scene.gaussians, config.max_gaussians, config.region, views, options, scene.num_invented
     )
-    kept = collect(GaussianRows(scene.gaussians, found.rows, scene.gaussians.sh_degree))
-    invented = int((found.rows >= count - scene.num_invented).sum())
-    return replace(scene, gaussians=kept, num_invented=invented), found
+    return replace(scene, gaussians=found.gaussians, num_invented=found.num_invented), found
 
 
 def _blocks_of(means: NDArray[np.float32], partition: Partition | None) -> NDArray[np.intp]:

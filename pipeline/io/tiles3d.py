@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pipeline.io.gltf import GAUSSIAN_SPLATTING, glb, splat_rendering
 from pipeline.io.spz import encode_spz
 from pipeline.runtime.atomic import write_bytes, write_json
-from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
+from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect, joined
 from pipeline.splats.chunks import LEAF, Rows, box, halves, in_z_order
 from pipeline.splats.levels import halved
 
@@ -64,7 +64,7 @@ class _Writer:
         if len(rows) > LEAF:
             parts = [self.write(part) for part in halves(self.gaussians.source.means, rows)]
             children = [entry for entry, *_ in parts]
-            own = halved(_joined([gaussians for _, gaussians, _ in parts]))
+            own = halved(joined([gaussians for _, gaussians, _ in parts]))
             boxes = [corners for *_, corners in parts]
             error = max(
                 _ERROR_DEVIATIONS * _typical_deviation(own),
@@ -115,11 +115,6 @@ def write_tiles3d(
         "root": root,
     }
     write_json(folder / TILESET, tileset)
-
-
-def _joined(parts: list[GaussianArrays]) -> GaussianArrays:
-    arrays = [part.arrays() for part in parts]
-    return GaussianArrays(**{name: np.concatenate([a[name] for a in arrays]) for name in arrays[0]})
 
 
 def _typical_deviation(gaussians: GaussianArrays) -> float:

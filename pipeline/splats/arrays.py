@@ -7,7 +7,7 @@ is never held for all Gaussians at once. Importing this module does not import t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -117,3 +117,9 @@ def collect(source: GaussianSource) -> GaussianArrays:
             array[start : start + len(values)] = values
         start += len(chunk[0])
     return GaussianArrays(**arrays)
+
+
+def joined(parts: Sequence[GaussianArrays]) -> GaussianArrays:
+    """The Gaussians of all parts, in their order."""
+    arrays = [part.arrays() for part in parts]
+    return GaussianArrays(**{name: np.concatenate([a[name] for a in arrays]) for name in NAMES})

@@ -1,7 +1,7 @@
 """Levels of detail: pairs of Gaussians are merged into one that looks the same from afar.
 
 The merged Gaussian has the mean and the covariance of the pair, weighted by opacity times mean
-projected area. Its opacity keeps that product. Pairs are chosen by Runnalls's bound of the
+projected area, or by given weights. Its opacity keeps that product. Pairs are chosen by Runnalls's bound of the
 information that a merge loses (Runnalls 2007, "Kullback-Leibler approach to Gaussian mixture
 reduction", equation 21), and by the difference of colours. Importing this module does not import
 torch.
@@ -24,6 +24,9 @@ _NEIGHBOURS = 8
 _COLOUR = 4.0
 # Rounds of matching with the same neighbours, and with new ones.
 _ROUNDS, _PASSES = 8, 20
+# The largest share of the Gaussians that a pass of ``merged_to`` merges away: few enough that the
+# costs of other pairs hold.
+_SHARE = 1 / 3
 # The exponent of Thomsen's approximation of an ellipsoid's surface, four times its mean projection.
 _THOMSEN = 1.6075
 _MAX_OPACITY = 0.9999
@@ -38,28 +41,49 @@ def halved(gaussians: GaussianArrays) -> GaussianArrays:
     for _ in range(_PASSES):
         if len(gaussians) <= target:
             break
-        gaussians = _merged(gaussians, len(gaussians) - target)
+        gaussians, _ = _merged(gaussians, len(gaussians) - target)
     return gaussians
 
 
-def _merged(gaussians: GaussianArrays, most: int) -> GaussianArrays:
-    """The Gaussians after up to ``most`` merges of disjoint pairs, the cheapest first."""
-    moments = _Moments(gaussians)
+def merged_to(gaussians: GaussianArrays, count: int, weights: Doubles) -> GaussianArrays:
+    """At most ``count`` Gaussians, which look like all of them.
+
+    Args:
+        weights: (N,) positive, what each adds to the pictures that matter. Pairs of small weights
+            are merged first, and the mean, covariance and colour of a pair are weighted by them.
+    """
+    while len(gaussians) > count:
+        most = min(len(gaussians) - count, max(1, int(_SHARE * len(gaussians))))
+        before = len(gaussians)
+        gaussians, weights = _merged(gaussians, most, weights)
+        if len(gaussians) == before:
+            break
+    return gaussians
+
+
+def _merged(
+    gaussians: GaussianArrays, most: int, weights: Doubles | None = None
+) -> tuple[GaussianArrays, Doubles]:
+    """The Gaussians after up to ``most`` merges of disjoint pairs, the cheapest first, and their
+    weights."""
+    moments = _Moments(gaussians, weights)
     pairs, costs = _matched(*_candidates(gaussians, moments), len(gaussians))
     pairs = pairs[np.argsort(costs, kind="stable")[:most]]
     alone = np.ones(len(gaussians), bool)
     alone[pairs] = False
     made = [_merge(gaussians, moments, pairs[i : i + CHUNK]) for i in range(0, len(pairs), CHUNK)]
     parts = [{name: values[alone] for name, values in gaussians.arrays().items()}, *made]
-    return GaussianArrays(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+    found = GaussianArrays(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+    return found, np.concatenate([moments.weights[alone], moments.weights[pairs].sum(1)])
 
 
 class _Moments:
-    """The weights (N,) and covariances (N, 3, 3) of Gaussians, and the logarithm (N,) of the
-    covariances' determinants."""
+    """The masses and weights (N,) and covariances (N, 3, 3) of Gaussians, and the logarithm (N,) of
+    the covariances' determinants. Weights are the masses (``weights_of``) if not given."""
 
-    def __init__(self, gaussians: GaussianArrays) -> None:
-        self.weights = weights_of(gaussians)
+    def __init__(self, gaussians: GaussianArrays, weights: Doubles | None = None) -> None:
+        self.masses = weights_of(gaussians)
+        self.weights = self.masses if weights is None else weights
         self.covariances = np.empty((len(gaussians), 3, 3))
         for start in range(0, len(gaussians), CHUNK):
             rows = slice(start, start + CHUNK)
@@ -165,7 +189,8 @@ def _merge(
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     scales = np.sqrt(np.maximum(variances, 1e-30))
     w = moments.weights[pairs]
-    opacities = np.minimum(w.sum(1) / _areas(scales), _MAX_OPACITY).clip(1e-6)
+    masses = moments.masses[pairs].sum(1)
+    opacities = np.minimum(masses / _areas(scales), _MAX_OPACITY).clip(1e-6)
     shares = w / w.sum(1, keepdims=True)
     found = {
         "means": means,

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.splats.arrays import GaussianArrays
-from pipeline.splats.levels import halved
+from pipeline.splats.levels import halved, merged_to
 from tests.splats.samples import sample
 
 
@@ -80,3 +80,22 @@ def test_the_same_gaussians_give_the_same_bits() -> None:
     first, second = (halved(sample(400).as_arrays()).arrays() for _ in range(2))
     for name, values in first.items():
         np.testing.assert_array_equal(values, second[name])
+
+
+@pytest.mark.parametrize("count", [1, 7, 100, 299, 300, 400])
+def test_merging_to_a_number_leaves_that_number(count) -> None:
+    gaussians = sample(300).as_arrays()
+    found = merged_to(gaussians, count, np.ones(300))
+    assert len(found) == min(count, 300)
+    assert all(np.isfinite(values).all() for values in found.arrays().values())
+
+
+def test_what_weighs_more_stays_and_leads_in_a_merge() -> None:
+    near, far = pair(1.0), pair(1.0)
+    far.means[:, 1] += 50
+    both = {n: np.concatenate([v, far.arrays()[n]]) for n, v in near.arrays().items()}
+    weights = np.array([1e-3, 3e-3, 1.0, 1.0])
+    found = merged_to(GaussianArrays(**both), 3, weights)
+    assert sorted(found.means[:, 1]) == [0, 50, 50], "the pair of small weights is merged"
+    made = found.means[found.means[:, 1] == 0][0]
+    assert made[0] == pytest.approx(0.075, abs=1e-6)

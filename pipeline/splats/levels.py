@@ -1,10 +1,10 @@
 """Levels of detail: pairs of Gaussians are merged into one that looks the same from afar.
 
 The merged Gaussian has the mean and the covariance of the pair, weighted by opacity times mean
-projected area, or by given weights. Its opacity keeps that product. Pairs are chosen by Runnalls's bound of the
-information that a merge loses (Runnalls 2007, "Kullback-Leibler approach to Gaussian mixture
-reduction", equation 21), and by the difference of colours. Importing this module does not import
-torch.
+projected area, or by given weights. Its opacity keeps that product. Pairs are chosen by Runnalls's
+bound of the information that a merge loses (Runnalls 2007, "Kullback-Leibler approach to Gaussian
+mixture reduction", equation 21), and by the difference of colours. Importing this module does not
+import torch.
 """
 
 from __future__ import annotations

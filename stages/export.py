@@ -53,6 +53,7 @@ def work(job: Job) -> None:
     from pipeline.io.appearance_files import Embeddings
     from pipeline.render.registry import use_device
     from pipeline.scene.blocks import Partition
+    from pipeline.scene.exposure import ExposureGains
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
@@ -67,6 +68,7 @@ def work(job: Job) -> None:
     scene = ExportScene(
         gaussians=inputs.filled_arrays(job),
         num_invented=num_invented(job.inputs.get("holes")),
+        gains=ExposureGains.read(job.inputs["train"]),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
@@ -155,6 +157,8 @@ SPEC = StageSpec(
         "zstandard",
         "scipy",
         "scikit-image",
+        "fast-simplification",
+        "xatlas",
         "opencv-contrib-python-headless",
     ),
 )

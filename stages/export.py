@@ -14,7 +14,7 @@ import hashlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.export import BLOCKS_FORMAT, DENSE_FORMATS, MASKS_FORMAT, Export
+from pipeline.config.export import BLOCKS_FORMAT, MASKS_FORMAT, Export
 from pipeline.config.schema import Split, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
@@ -144,7 +144,7 @@ SPEC = StageSpec(
     | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)}
     | {"photos": inputs.PHOTOS},
     only_if={
-        "dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats),
+        "dense": lambda config: bool(config.export.dense_formats),
         "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
         "photos": lambda config: MASKS_FORMAT in config.export.formats,
     },

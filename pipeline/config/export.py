@@ -38,7 +38,7 @@ ExportFormat = Literal[
     "video",
 ]
 ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
-# The formats that need multi-view stereo.
+# The formats that need multi-view stereo; the mesh of a region is of its Gaussians alone.
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps", "mesh"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
@@ -103,3 +103,13 @@ class Export(Section):
         "pixels of the photographs. null: 4096.",
     )
     video: VideoExport = Field(default_factory=VideoExport)
+
+    @property
+    def dense_formats(self) -> list[ExportFormat]:
+        """The formats for which multi-view stereo runs."""
+        cropped = self.region is not None
+        return [
+            name
+            for name in self.formats
+            if name in DENSE_FORMATS and not (cropped and name == "mesh")
+        ]

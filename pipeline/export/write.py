@@ -386,6 +386,8 @@ def _write_rendered_formats(
     # The module is imported here because it imports torch and is rarely used.
     from pipeline.surface.outputs import Observed, write_rendered
 
+    # Depths of multi-view stereo are not cropped.
+    dense = scene.dense if "mesh" in config.dense_formats else None
     messages = write_rendered(
         out,
         config,
@@ -395,7 +397,7 @@ def _write_rendered_formats(
         up=scene_up(scene.views, scene.manifest),
         origin=scene.normalization.origin,
         num_invented=scene.num_invented,
-        observed=Observed(scene.gains, scene.dense, 1 / scale),
+        observed=Observed(scene.gains, dense, 1 / scale),
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

@@ -32,6 +32,7 @@ from benchmarks.results import (
     SlurmResult,
     StabilityResult,
     StressResult,
+    SurfaceResult,
 )
 from benchmarks.sfm import summary
 from pipeline.runtime.errors import UserError
@@ -93,6 +94,24 @@ def light(found: Sequence[LightResult]) -> str:
         values = (f"{r.psnr:.2f}", f"{r.psnr_right:.2f}", cell(difference, "+.2f"))
         others = (f"{r.psnr_own:.2f}", cell(r.psnr_withheld, ".2f"), f"{r.seconds:.0f}")
         rows.append([r.world, str(r.seed), r.pixels, str(r.steps), chosen, *values, *others])
+    return markdown.table(rows)
+
+
+def surface(found: Sequence[SurfaceResult]) -> str:
+    """One row for each mesh."""
+    rows = [
+        [
+            *("depths", "triangles", "vertices off (mm)", "surface off (mm)", "90 % within (mm)"),
+            *("complete (%)", "vertex colours (dB)", "texture (dB)", "texture (px)"),
+            *("mesh (s)", "texture (s)"),
+        ]
+    ]
+    for r in found:
+        errors = (f"{value:.1f}" for value in (r.vertex_error_mm, r.error_mm, r.p90_mm))
+        colours = (f"{r.psnr_vertices:.1f}", cell(r.psnr_texture, ".1f"), str(r.texture_px or "-"))
+        times = (f"{r.mesh_s:.0f}", cell(r.texture_s, ".0f"))
+        complete = f"{100 * r.completeness:.1f}"
+        rows.append([r.depths, f"{r.triangles:,}", *errors, complete, *colours, *times])
     return markdown.table(rows)
 
 
@@ -280,6 +299,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "budget-curves": (BudgetResult, budget_tables.curves),
     "novel_views": (NovelViewResult, novel_views),
     "light": (LightResult, light),
+    "surface": (SurfaceResult, surface),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

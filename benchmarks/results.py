@@ -412,6 +412,48 @@ class LightResult:
     seconds: float
 
 
+# ---- benchmarks.surface ----
+
+
+@dataclass(frozen=True)
+class SurfaceResult:
+    """A mesh of the demo scene.
+
+    Attributes:
+        depths: The depth maps: "rendered" alone, or "both" with those of multi-view stereo.
+        share: The wanted number of triangles, over that of marching cubes.
+        voxel_mm: The side of a voxel.
+        vertex_error_mm: The median distance of the vertices from the true surface.
+        error_mm, p90_mm: The median and the 90th percentile of the distance of points spread evenly
+            over the mesh.
+        completeness: The share of the true surface, where at least three training views see it,
+            within two voxels of the mesh.
+        psnr_vertices, psnr_texture: Of renders in the test views, with colours at the vertices and
+            with the texture; None without one.
+        texture_px: The larger of the texture's width and height; 0 without one.
+        mesh_s, texture_s, train_s, dense_s: The times of the mesh and its texture, of training and
+            of multi-view stereo.
+    """
+
+    seed: int
+    pixels: str
+    depths: str
+    share: float
+    triangles: int
+    voxel_mm: float
+    vertex_error_mm: float
+    error_mm: float
+    p90_mm: float
+    completeness: float
+    psnr_vertices: float
+    psnr_texture: float | None
+    texture_px: int
+    mesh_s: float
+    texture_s: float | None
+    train_s: float
+    dense_s: float
+
+
 # ---- benchmarks.pose_conventions ----
 
 PoseOutcome = Literal["agree", "named", "refused", "warned", "silent"]

@@ -30,7 +30,8 @@ from pipeline.splats.reduce import reduce_gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import Mesh
-from pipeline.surface.outputs import Messages, make_mesh
+from pipeline.surface.outputs import Messages, make_mesh, make_texture
+from pipeline.surface.texture import Photographs
 from splatmake.camera import Camera
 from splatmake.files import warn
 from splatmake.quality import Quality, quality_of
@@ -181,19 +182,28 @@ class Scene:
         warn(splat_files.write_gaussians(path, reduced, antialias=self._train.antialias))
 
     def mesh(
-        self, file: str | PathLike[str], *, voxel: float | None = None, progress: bool = False
+        self,
+        file: str | PathLike[str],
+        *,
+        voxel: float | None = None,
+        faces: int | None = None,
+        progress: bool = False,
     ) -> Mesh:
-        """Make a triangle mesh with vertex colours from the depths of the training views, write it
-        as .ply or .glb, and return it.
+        """Make a triangle mesh from the Gaussians' depths in the training views, write it as .ply
+        with vertex colours or as .glb with a texture from the photographs, and return it.
+
+        The mesh of the export stage also uses depths of multi-view stereo.
 
         Args:
             voxel: The side of a voxel in the unit of the file, which is that of given poses; None
                 for 2.5 pixels at the median depth. It is enlarged, with a warning, if the mesh
                 would need too much memory.
+            faces: The number of triangles; None for an eighth of those of marching cubes.
             progress: Whether to show the progress on stderr.
 
         Raises:
-            UserError: The suffix or ``voxel`` is wrong, or the views have no common surface.
+            UserError: The suffix, ``voxel`` or ``faces`` is wrong, the views have no common
+                surface, or a photograph cannot be read.
         """
         path = Path(file)
         if path.suffix.lower() not in (".ply", ".glb"):
@@ -201,6 +211,8 @@ class Scene:
             raise UserError(what, file=path, fix="give the file one of these suffixes")
         if voxel is not None and not 0 < voxel < np.inf:
             raise UserError(f"voxel: expected a length above 0, found {voxel}", file=path)
+        if faces is not None and faces < 4:
+            raise UserError(f"faces: expected at least 4 triangles, found {faces}", file=path)
         unit = self._posed.unit
         views = [unit.view_to_given(view) for view in self.views]
         gaussians = Gaussians.sharing(self.gaussians.as_arrays().scaled(1 / unit.scale))
@@ -210,16 +222,18 @@ class Scene:
         messages = Messages([], [])
         with tempfile.TemporaryDirectory() as folder, progress_shown(progress):
             maps = DepthMaps(RenderCache(gaussians, views, options, Path(folder)))
-            mesh = make_mesh(maps, voxel, self._threads, messages)
-        said = [text.replace("export.mesh_voxel", "voxel") for text in messages.warnings]
-        if mesh is None:
-            raise UserError(*said, file=path)
-        if path.suffix.lower() == ".ply":
-            write_mesh_ply(path, mesh)
-        else:
-            write_mesh_glb(path, mesh, self.up)
+            made = make_mesh(maps, voxel, faces, self._threads, messages)
+            said = [text.replace("export.mesh_voxel", "voxel") for text in messages.warnings]
+            if made is None:
+                raise UserError(*said, file=path)
+            if path.suffix.lower() == ".ply":
+                write_mesh_ply(path, made.mesh)
+            else:
+                photographs = Photographs(views, self._posed.gains)
+                textured = make_texture(made, photographs, None, self._threads, messages)
+                write_mesh_glb(path, textured, self.up)
         warn(said)
-        return mesh
+        return made.mesh
 
 
 def load(

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.export import DENSE_FORMATS
 from pipeline.mvs.counters import DenseCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config
-    users = [f"export.formats: {name}" for name in config.export.formats if name in DENSE_FORMATS]
+    users = [f"export.formats: {name}" for name in config.export.dense_formats]
     if config.init.method == "dense":
         users.insert(0, "init.method: dense")
     if users:

@@ -14,7 +14,7 @@ import hashlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.export import BLOCKS_FORMAT, DENSE_FORMATS, MASKS_FORMAT, Export
+from pipeline.config.export import BLOCKS_FORMAT, MASKS_FORMAT, Export
 from pipeline.config.schema import Split, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
@@ -53,6 +53,7 @@ def work(job: Job) -> None:
     from pipeline.io.appearance_files import Embeddings
     from pipeline.render.registry import use_device
     from pipeline.scene.blocks import Partition
+    from pipeline.scene.exposure import ExposureGains
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
@@ -67,6 +68,7 @@ def work(job: Job) -> None:
     scene = ExportScene(
         gaussians=inputs.filled_arrays(job),
         num_invented=num_invented(job.inputs.get("holes")),
+        gains=ExposureGains.read(job.inputs["train"]),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
@@ -142,7 +144,7 @@ SPEC = StageSpec(
     | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)}
     | {"photos": inputs.PHOTOS},
     only_if={
-        "dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats),
+        "dense": lambda config: bool(config.export.dense_formats),
         "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
         "photos": lambda config: MASKS_FORMAT in config.export.formats,
     },
@@ -155,6 +157,8 @@ SPEC = StageSpec(
         "zstandard",
         "scipy",
         "scikit-image",
+        "fast-simplification",
+        "xatlas",
         "opencv-contrib-python-headless",
     ),
 )

@@ -38,8 +38,8 @@ ExportFormat = Literal[
     "video",
 ]
 ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
-# The formats that need multi-view stereo.
-DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
+# The formats that need multi-view stereo; the mesh of a region is of its Gaussians alone.
+DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps", "mesh"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
 # The format that needs the photographs before undistortion.
@@ -72,7 +72,8 @@ class Export(Section):
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
         "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
         "train.transients left out, as masks of the photographs (PNG). Rendered from every view: "
-        "renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera path).",
+        "renders (PNG), depths (float TIFF), video (along a camera path). From both: mesh (GLB "
+        "with a texture from the photographs, and PLY with colours).",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     max_gaussians: GaussianCount | None = Field(
@@ -91,4 +92,24 @@ class Export(Section):
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "
         "would take over 24 million voxels.",
     )
+    mesh_faces: Annotated[int, Field(ge=4, le=50_000_000), Unit("triangles")] | None = Field(
+        None,
+        description="Triangles of the mesh, fewer by quadric error metrics. null: an eighth of "
+        "those of marching cubes.",
+    )
+    texture_px: Annotated[int, Field(ge=64, le=8192), Unit("pixels")] | None = Field(
+        None,
+        description="Largest width and height of the mesh's texture, whose size follows from the "
+        "pixels of the photographs. null: 4096.",
+    )
     video: VideoExport = Field(default_factory=VideoExport)
+
+    @property
+    def dense_formats(self) -> list[ExportFormat]:
+        """The formats for which multi-view stereo runs."""
+        cropped = self.region is not None
+        return [
+            name
+            for name in self.formats
+            if name in DENSE_FORMATS and not (cropped and name == "mesh")
+        ]

@@ -32,7 +32,9 @@ from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
 from pipeline.photos.found_masks import PosedPhotos, write_photo_masks
 from pipeline.photos.naming import rename
+from pipeline.render import RasterOptions
 from pipeline.scene.blocks import Partition
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
@@ -79,6 +81,7 @@ class ExportScene:
         partition: The blocks of the scene; None if the scene is one block.
         found: The masks that training found; None if they are not exported.
         num_invented: The number of invented Gaussians.
+        gains: The exposures of the views.
     """
 
     gaussians: GaussianArrays
@@ -93,6 +96,7 @@ class ExportScene:
     partition: Partition | None = None
     found: FoundMasks | None = None
     num_invented: int = 0
+    gains: ExposureGains = NO_GAINS
 
     @property
     def normalization(self) -> Normalization:
@@ -288,7 +292,8 @@ def export_scene(
         report.decisions.append("no masks: training left nothing out (train.transients)")
     _write_frame(out, files, written, train, split)
     if not set(config.formats) <= WRITERS.keys():
-        _write_rendered_formats(out, scene, config, train, split, threads, report)
+        options = choose_protocol(scene.training_size_views, split, train).options(train, threads)
+        _write_rendered_formats(out, scene, config, options, normalization.scale, report)
     return report
 
 
@@ -368,24 +373,30 @@ def _write_rendered_formats(
     out: Path,
     scene: ExportScene,
     config: Export,
-    train: Train,
-    split: Split,
-    threads: int,
+    options: RasterOptions,
+    scale: float,
     report: ExportReport,
 ) -> None:
-    """Write the formats that need renders of the trained Gaussians."""
-    # The module is imported here because it imports torch and is rarely used.
-    from pipeline.surface.outputs import write_rendered
+    """Write the formats that need renders of the trained Gaussians.
 
+    Args:
+        scale: The length of the unit of ``scene`` in the unit of training.
+    """
+    # The module is imported here because it imports torch and is rarely used.
+    from pipeline.surface.outputs import Observed, write_rendered
+
+    # Depths of multi-view stereo are not cropped.
+    dense = scene.dense if "mesh" in config.dense_formats else None
     messages = write_rendered(
         out,
         config,
         Gaussians.sharing(scene.gaussians),
         scene.training_size_views,
-        choose_protocol(scene.training_size_views, split, train).options(train, threads),
+        options,
         up=scene_up(scene.views, scene.manifest),
         origin=scene.normalization.origin,
         num_invented=scene.num_invented,
+        observed=Observed(scene.gains, dense, 1 / scale),
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.depth_tiff import write_depth_tiff
+from pipeline.mvs.maps import DenseMap, read_map
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
 from pipeline.render import RasterOptions
@@ -20,6 +21,11 @@ from pipeline.splats.gaussians import Gaussians
 
 #: Least accumulated opacity of a pixel with a depth.
 MIN_ALPHA = 0.5
+#: Least confidence of a depth of multi-view stereo that is preferred to the rendered one.
+MIN_CONFIDENCE = 0.25
+#: The weight of a depth of multi-view stereo with a confidence of 1, beside rendered ones, which
+#: weigh 1.
+DENSE_WEIGHT = 6.0
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,13 @@ class DepthMap:
         depth: (H, W) float32 camera z at pixel centres, world units; 0 if unknown, inf if the ray
             meets no surface.
         rgb: (H, W, 3) uint8.
+        weight: (H, W) float32 how much a depth counts: 1 for a rendered one; None for 1 everywhere.
     """
 
     view: View
     depth: NDArray[np.float32]
     rgb: NDArray[np.uint8]
+    weight: NDArray[np.float32] | None = None
 
     def surface(self, far: float) -> NDArray[np.float32]:
         """The depths below ``far``; 0 elsewhere."""
@@ -85,13 +93,18 @@ class DepthMap:
 
 
 class DepthMaps:
-    """Median depth maps of the training views; can be iterated repeatedly.
+    """Depth maps of the training views; can be iterated repeatedly.
 
-    Masked pixels are unknown (0); transparent pixels of a photograph are empty (inf).
+    A depth is that of multi-view stereo where it is confident, else the rendered median. Masked
+    pixels are unknown (0); transparent pixels of a photograph are empty (inf).
+
+    Args:
+        dense: The folder of the dense stage; None for rendered depths alone.
+        unit: The length of the dense stage's unit of length in the renders' unit.
     """
 
-    def __init__(self, renders: RenderCache):
-        self._renders = renders
+    def __init__(self, renders: RenderCache, dense: Path | None = None, unit: float = 1.0):
+        self._renders, self._dense, self._unit = renders, dense, unit
         self._count = sum(not view.is_test for view in renders.views)
 
     def __len__(self) -> int:
@@ -103,12 +116,22 @@ class DepthMaps:
             if view.is_test:
                 continue
             photo = load_view(view)
-            depth = np.array(rendered.median)
+            depth, weight = np.array(rendered.median), None
+            if self._dense is not None:
+                depth, weight = self._combined(depth, read_map(self._dense, view.name))
             if photo.alpha is not None:
                 depth[photo.alpha == 0] = np.inf
             if photo.mask is not None:
                 depth[~photo.mask] = 0
-            yield DepthMap(view, depth, rendered.rgb)
+            yield DepthMap(view, depth, rendered.rgb, weight)
+
+    def _combined(
+        self, rendered: NDArray[np.float32], dense: DenseMap
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The depths and their weights."""
+        chosen = dense.confidence >= MIN_CONFIDENCE
+        depth = np.where(chosen, dense.depth * np.float32(self._unit), rendered)
+        return depth, np.where(chosen, np.float32(DENSE_WEIGHT) * dense.confidence, np.float32(1))
 
 
 def write_renders(folder: Path, renders: RenderCache) -> None:

@@ -6,14 +6,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.runtime.atomic import write_bytes
 from pipeline.surface.mesh import Mesh
+from pipeline.surface.texture import TexturedMesh
 
-_FLOAT, _USHORT, _UINT = 5126, 5123, 5125  # component types of glTF
+_FLOAT, _UINT = 5126, 5125  # component types of glTF
 _ARRAY, _ELEMENT = 34962, 34963  # buffer targets of glTF
+_LINEAR, _CLAMP = 9729, 33071  # filter and wrapping of glTF
+_QUALITY = 95  # of JPEG textures
 
 
 def write_mesh_ply(path: Path, mesh: Mesh) -> None:
@@ -40,20 +44,17 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
     write_bytes(path, "\n".join(header).encode() + vertex.tobytes() + face.tobytes())
 
 
-def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
-    """Binary glTF 2.0: positions in the world's frame, normals, COLOR_0, unlit (the colours
-    include the lighting).
+def write_mesh_glb(path: Path, mesh: TexturedMesh, up: NDArray[np.float64]) -> None:
+    """Binary glTF 2.0: positions in the world's frame, normals, TEXCOORD_0, the texture as JPEG,
+    unlit (the colours include the lighting).
 
     Args:
         up: (3,) up vector of the world; the node's rotation takes it to glTF's, +y.
     """
-    linear = _linear(mesh.colors / 255.0)
-    color = np.full((len(linear), 4), 65535, np.uint16)
-    color[:, :3] = np.rint(linear * 65535)
     arrays = [
         (mesh.vertices.astype("<f4"), _FLOAT, "VEC3", _ARRAY),
         (mesh.normals.astype("<f4"), _FLOAT, "VEC3", _ARRAY),
-        (color.astype("<u2"), _USHORT, "VEC4", _ARRAY),
+        (mesh.uv.astype("<f4"), _FLOAT, "VEC2", _ARRAY),
         (mesh.faces.astype("<u4").reshape(-1), _UINT, "SCALAR", _ELEMENT),
     ]
     views: list[dict[str, Any]] = []
@@ -70,10 +71,12 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
         "min": mesh.vertices.min(axis=0).astype(float).tolist(),
         "max": mesh.vertices.max(axis=0).astype(float).tolist(),
     }
-    accessors[2]["normalized"] = True
-    body = b"".join(array.tobytes() for array, *_ in arrays)
+    picture = _jpeg(mesh.picture)
+    views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(picture)})
+    body = b"".join(array.tobytes() for array, *_ in arrays) + picture
+    body += b"\0" * (-len(body) % 4)
     primitive = {
-        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
+        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
         "indices": 3,
         "material": 0,
     }
@@ -87,9 +90,19 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
         "materials": [
             {
                 "extensions": {"KHR_materials_unlit": {}},
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": 1.0,
+                },
                 "doubleSided": True,
             }
+        ],
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"bufferView": len(arrays), "mimeType": "image/jpeg"}],
+        # Without mipmaps, which would mix charts; edges are clamped.
+        "samplers": [
+            {"magFilter": _LINEAR, "minFilter": _LINEAR, "wrapS": _CLAMP, "wrapT": _CLAMP}
         ],
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
@@ -105,9 +118,12 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
     write_bytes(path, b"".join(out))
 
 
-def _linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    """The (H, W, 3) picture, with chroma at full resolution."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
+    return data.tobytes()
 
 
 def _rotation_to_y_up(up: NDArray[np.float64]) -> list[float]:

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from pipeline.surface.depth import DepthMap, DepthMaps
+from pipeline.surface.simplify import simplify
 from pipeline.surface.tsdf import (
     BLOCK,
     Grid,
@@ -25,8 +26,9 @@ from pipeline.surface.tsdf import (
     project_to_pixels,
 )
 
-#: Least weight of a voxel: the number of views that see a surface there.
-MIN_VIEWS = 2
+#: Least weight of a voxel: two rendered depths, or one of multi-view stereo, which other views have
+#: confirmed.
+MIN_WEIGHT = 2.0
 #: Connected pieces with a smaller share of the triangles are removed as floaters.
 SMALL_PIECE = 0.002
 
@@ -189,12 +191,13 @@ def vertex_colors(
 
 
 def build_mesh(
-    depths: DepthMaps, voxel: float | None, threads: int
+    depths: DepthMaps, voxel: float | None, threads: int, count: int | None = None
 ) -> tuple[Mesh | None, Grid | None]:
     """Fuse depth maps to a mesh; the result is the same bits at any number of threads.
 
     Args:
         voxel: The side of a voxel, world units; None chooses one (see ``choose_grid``).
+        count: The number of triangles; None for ``simplify.SHARE`` of those of marching cubes.
 
     Returns:
         The mesh and its grid; None if there is no surface.
@@ -203,11 +206,12 @@ def build_mesh(
     if grid is None:
         return None, None
     field = fuse(grid, depths, threads)
-    vertices, faces = extract(field, min(MIN_VIEWS, len(depths)))
+    vertices, faces = extract(field, min(MIN_WEIGHT, len(depths)))
     del field
     vertices, faces = remove_small_pieces(vertices, faces, int(np.ceil(SMALL_PIECE * len(faces))))
     if len(faces) == 0:
         return None, grid
+    vertices, faces = simplify(vertices, faces, count, grid.voxel)
     normals = vertex_normals(vertices, faces)
     colors = vertex_colors(vertices, normals, depths, grid.truncation, threads)
     mesh = Mesh(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -14,18 +15,42 @@ from pipeline.config.video import VideoExport
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.progress import track
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache, write_depths, write_renders
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import Mesh, build_mesh
 from pipeline.surface.path import camera_path, describe_path
+from pipeline.surface.texture import Photographs, TexturedMesh, texture_mesh
 from pipeline.surface.tsdf import BLOCK
 from pipeline.surface.video import write_video
 
 #: Number of views from which the typical depth is measured.
 _DEPTH_VIEWS = 8
 _NO_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What is known of the photographs beside the Gaussians.
+
+    Attributes:
+        gains: Their exposures.
+        dense: The folder of the dense stage; None if it did not run.
+        dense_unit: The length of the dense stage's unit in the unit of the Gaussians.
+    """
+
+    gains: ExposureGains = NO_GAINS
+    dense: Path | None = None
+    dense_unit: float = 1.0
+
+
+class Made(NamedTuple):
+    """A mesh and the side of the voxels that it was made of, world units."""
+
+    mesh: Mesh
+    voxel: float
 
 
 class Messages(NamedTuple):
@@ -45,6 +70,7 @@ def write_rendered(
     up: NDArray[np.float64],
     origin: NDArray[np.float64] = _NO_ORIGIN,
     num_invented: int = 0,
+    observed: Observed | None = None,
 ) -> Messages:
     """Write the outputs that ``config.formats`` names: ``renders/``, ``depths/``, ``mesh.ply`` and
     ``mesh.glb``, the video and its camera path ``path.json``.
@@ -55,8 +81,9 @@ def write_rendered(
         up: (3,) up vector of the world.
         origin: (3,) the world's origin in the world of the exported cameras.
         num_invented: The number of invented Gaussians, the last ones. Only the video shows them.
+        observed: What the mesh is made of beside the Gaussians.
     """
-    formats = config.formats
+    formats, observed = config.formats, observed or Observed()
     messages = Messages([], [])
     if not {"renders", "depths", "mesh"}.isdisjoint(formats):
         with TemporaryDirectory(prefix="renders-") as folder:
@@ -67,10 +94,17 @@ def write_rendered(
             if "depths" in formats:
                 write_depths(out / "depths", renders)
             if "mesh" in formats:
-                mesh = make_mesh(DepthMaps(renders), config.mesh_voxel, options.threads, messages)
-                if mesh is not None:
-                    write_mesh_ply(out / "mesh.ply", mesh)
-                    write_mesh_glb(out / "mesh.glb", mesh, up)
+                maps = DepthMaps(renders, observed.dense, observed.dense_unit)
+                made = make_mesh(
+                    maps, config.mesh_voxel, config.mesh_faces, options.threads, messages
+                )
+                if made is not None:
+                    write_mesh_ply(out / "mesh.ply", made.mesh)
+                    photographs = Photographs(views, observed.gains)
+                    textured = make_texture(
+                        made, photographs, config.texture_px, options.threads, messages
+                    )
+                    write_mesh_glb(out / "mesh.glb", textured, up)
     if "video" in formats:
         _write_video(out, config.video, gaussians, views, options, up, origin, messages)
     return messages
@@ -102,15 +136,19 @@ def _write_video(
 
 
 def make_mesh(
-    depths: DepthMaps, voxel: float | None, threads: int, messages: Messages
-) -> Mesh | None:
+    depths: DepthMaps,
+    voxel: float | None,
+    count: int | None,
+    threads: int,
+    messages: Messages,
+) -> Made | None:
     """The mesh of the surfaces in depth maps; None, with a warning, if there is none.
 
     Args:
-        voxel: The argument of ``build_mesh``.
+        voxel, count: The arguments of ``build_mesh``.
         messages: The messages that those about the mesh are added to.
     """
-    mesh, grid = build_mesh(depths, voxel, threads)
+    mesh, grid = build_mesh(depths, voxel, threads, count)
     if mesh is None or grid is None:
         why = "the depth maps of the views contain no common surface"
         if voxel is not None and grid is not None and voxel * BLOCK > grid.far:
@@ -129,7 +167,24 @@ def make_mesh(
             f"export.mesh_voxel: voxels of {voxel:.4g} need too much memory, or are far smaller "
             f"than a pixel of the views; used {grid.voxel:.4g}"
         )
-    return mesh
+    return Made(mesh, grid.voxel)
+
+
+def make_texture(
+    made: Made, photographs: Photographs, most_px: int | None, threads: int, messages: Messages
+) -> TexturedMesh:
+    """The mesh with a texture.
+
+    Args:
+        most_px: The argument of ``texture_mesh``.
+        messages: The messages that those about the texture are added to.
+    """
+    textured = texture_mesh(made.mesh, photographs, made.voxel, most_px, threads)
+    height, width = textured.picture.shape[:2]
+    messages.decisions.append(
+        f"texture: {width}x{height} pixels from {len(photographs.views)} photographs"
+    )
+    return textured
 
 
 def _typical_depth(gaussians: Gaussians, views: list[View], options: RasterOptions) -> float:

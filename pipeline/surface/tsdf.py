@@ -70,8 +70,8 @@ class Tsdf:
         grid: The voxels.
         distance: (B, 8, 8, 8) float32, mean signed distance over the truncation, -1 to 1, positive
             in front of the surface; 0 where the weight is 0.
-        weight: (B, 8, 8, 8) float32, number of views that saw a surface there, plus
-            ``FREE_SPACE_WEIGHT`` for each that saw free space.
+        weight: (B, 8, 8, 8) float32, sum of the weights of the views that saw a surface there, plus
+            ``FREE_SPACE_WEIGHT`` times those of the views that saw free space.
     """
 
     grid: Grid
@@ -242,7 +242,8 @@ def _integrate(
     seen &= (found > 0) & (share > -1)
     # Depths beyond ``far`` only prove free space.
     seen &= (found < grid.far) | (share > 1)
-    contribution = seen * np.where(share > 1, np.float32(FREE_SPACE_WEIGHT), np.float32(1))
+    each = np.float32(1) if depth.weight is None else depth.weight.reshape(-1)[pixel]
+    contribution = seen * each * np.where(share > 1, np.float32(FREE_SPACE_WEIGHT), np.float32(1))
     weight[rows] += contribution
     total[rows] += contribution * np.clip(share, -1, 1)
 

@@ -27,6 +27,7 @@ from benchmarks.results import (
     SlurmResult,
     StabilityResult,
     StressResult,
+    SurfaceResult,
 )
 from benchmarks.sfm.summary import Cost, Run
 from benchmarks.tables import KINDS, MARKER, RECORDS, pages, rewritten
@@ -101,6 +102,13 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
             *(30.0, 29.5, 30.0, None, 61.2),
         ),
         "| plain | 0 | 240x180 | 1500 | none | 30.00 | 29.50 | +0.00 | 30.00 | - | 61 |",
+    ),
+    "surface": (
+        SurfaceResult(
+            *(0, "320x240", "both", 0.5, 20_000, 27.0, 3.1, 2.4, 12.34, 0.957, 25.0, 28.91, 1200),
+            *(12.0, 40.0, 60.0, 80.0),
+        ),
+        "| both | 20,000 | 3.1 | 2.4 | 12.3 | 95.7 | 25.0 | 28.9 | 1200 | 12 | 40 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

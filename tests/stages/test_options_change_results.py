@@ -159,6 +159,8 @@ FLIPS = {
     "export.max_gaussians": Flip(100, POSED),
     "export.region": Flip("subject", POSED),
     "export.mesh_voxel": Flip(0.5, MESH),
+    "export.mesh_faces": Flip(40, MESH),
+    "export.texture_px": Flip(64, MESH),
     "export.video.path": Flip("cameras", VIDEO),
     "export.video.seconds": Flip(2.0, VIDEO),
     "export.video.fps": Flip(5, VIDEO),

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import tests.surface.accuracy as surface
+import benchmarks.mesh_accuracy as surface
+from benchmarks.mesh_accuracy import FOCUS, Similarity, measure, sample, true_points
 from pipeline.demo.scene import OBJECTS, ROOM, distance, trace
 from pipeline.surface.mesh import build_mesh
-from tests.surface.accuracy import FOCUS, Similarity, measure, sample, true_points
 from tests.surface.scenes import demo_room
 
 

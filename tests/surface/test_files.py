@@ -1,15 +1,18 @@
-"""PLY and GLB files, read back by their headers alone."""
+"""PLY and GLB files, read back by their headers alone, and by Khronos's validator."""
 
 from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import Mesh
+from pipeline.surface.texture import TexturedMesh
+from tests.io.test_independent import HERE, needs_node, node
 
 
 @pytest.fixture
@@ -22,6 +25,14 @@ def mesh():
         (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
         np.array([[0, 0, 0], [255, 255, 255], [128, 64, 32], [1, 2, 3], [9, 200, 77]], np.uint8),
     )
+
+
+@pytest.fixture
+def textured(mesh):
+    ramp = np.linspace(20, 220, 24).astype(np.uint8)
+    picture = np.dstack([np.tile(ramp, (16, 1)), np.full((16, 24), 100, np.uint8)] * 2)[..., :3]
+    uv = np.random.default_rng(1).random((5, 2)).astype(np.float32)
+    return TexturedMesh(mesh.vertices, mesh.faces, mesh.normals, uv, picture)
 
 
 def test_ply_header_describes_the_data(tmp_path, mesh):
@@ -42,7 +53,8 @@ def test_ply_header_describes_the_data(tmp_path, mesh):
 
 
 def read_glb(data: bytes):
-    """The JSON and the accessors' arrays, with the container's own lengths checked."""
+    """The JSON, the accessors' arrays and the binary chunk, with the container's own lengths
+    checked."""
     assert data[:4] == b"glTF"
     version, total, size = np.frombuffer(data, "<u4", 3, 4)
     assert (version, total) == (2, len(data))
@@ -58,31 +70,43 @@ def read_glb(data: bytes):
     arrays = []
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
-        kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[accessor["componentType"]]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
         assert view["byteOffset"] % 4 == 0
         count = accessor["count"] * width
         array = np.frombuffer(rest[8:], kind, count, view["byteOffset"])
         assert array.nbytes == view["byteLength"]
         arrays.append(array.reshape(-1, width))
-    return document, arrays
+    return document, arrays, rest[8:]
 
 
-def test_glb_holds_the_mesh_in_gltfs_units(tmp_path, mesh):
-    write_mesh_glb(tmp_path / "mesh.glb", mesh, np.array([0.0, -1.0, 0.0]))
-    document, arrays = read_glb((tmp_path / "mesh.glb").read_bytes())
+def test_glb_holds_the_mesh_and_its_texture(tmp_path, textured):
+    write_mesh_glb(tmp_path / "mesh.glb", textured, np.array([0.0, -1.0, 0.0]))
+    document, arrays, body = read_glb((tmp_path / "mesh.glb").read_bytes())
     primitive = document["meshes"][0]["primitives"][0]
     names = primitive["attributes"]
-    position, normal, color = (arrays[names[n]] for n in ("POSITION", "NORMAL", "COLOR_0"))
-    assert np.array_equal(position, mesh.vertices)
-    assert np.array_equal(normal, mesh.normals)
-    assert np.array_equal(arrays[primitive["indices"]].reshape(-1, 3), mesh.faces)
+    position, normal, uv = (arrays[names[n]] for n in ("POSITION", "NORMAL", "TEXCOORD_0"))
+    assert np.array_equal(position, textured.vertices)
+    assert np.array_equal(normal, textured.normals)
+    assert np.array_equal(uv, textured.uv)
+    assert np.array_equal(arrays[primitive["indices"]].reshape(-1, 3), textured.faces)
     box = document["accessors"][names["POSITION"]]
     assert np.array_equal(np.float32(box["min"]), position.min(axis=0))
     assert np.array_equal(np.float32(box["max"]), position.max(axis=0))
-    # COLOR_0 is linear light: sRGB's middle grey 128 is 0.2159 of it.
-    assert (color[:, 3] == 65535).all() and color[1, 0] == 65535 and color[0, 0] == 0
-    assert abs(color[2, 0] / 65535 - 0.21586) < 1e-4
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    data = body[view["byteOffset"] :][: view["byteLength"]]
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert found.shape == textured.picture.shape
+    assert np.abs(found.astype(int) - textured.picture).max() < 8
+
+
+def test_khronos_validator_finds_nothing_in_a_mesh(tmp_path, textured):
+    needs_node("gltf-validator")
+    write_mesh_glb(tmp_path / "mesh.glb", textured, np.array([0.0, 0.0, 1.0]))
+    found = json.loads(node(HERE / "read.mjs", "validate", tmp_path / "mesh.glb"))
+    codes = {message["code"] for message in found["issues"]["messages"]}
+    assert codes <= {"IMAGE_NPOT_DIMENSIONS"}, "glTF 2.0 allows any size"
+    assert found["info"]["totalVertexCount"] == 5 and found["info"]["hasTextures"]
 
 
 @pytest.mark.parametrize(
@@ -95,10 +119,10 @@ def test_glb_holds_the_mesh_in_gltfs_units(tmp_path, mesh):
         ((0.6, 0.0, -0.8), (0.48, -0.8, 0.36)),
     ],
 )
-def test_glb_stands_upright(tmp_path, mesh, up, forward):
+def test_glb_stands_upright(tmp_path, textured, up, forward):
     """The heading is that of Gaussians in a .glb file: forward is +z, also if up is about -y."""
-    write_mesh_glb(tmp_path / "mesh.glb", mesh, np.array(up, float))
-    document, _ = read_glb((tmp_path / "mesh.glb").read_bytes())
+    write_mesh_glb(tmp_path / "mesh.glb", textured, np.array(up, float))
+    document, *_ = read_glb((tmp_path / "mesh.glb").read_bytes())
     x, y, z, w = document["nodes"][0]["rotation"]
     rotation = quat_to_rotation(np.array([w, x, y, z]))
     np.testing.assert_allclose(rotation @ up, (0, 1, 0), atol=2e-6)

@@ -17,6 +17,7 @@ from pipeline.config.schema import Split, Train
 from pipeline.config.video import VideoExport
 from pipeline.io.videofile import read_video_facts
 from pipeline.metrics.protocol import choose_protocol
+from pipeline.mvs.maps import DenseMap, write_map
 from pipeline.render.views import render_rgb
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
@@ -115,8 +116,40 @@ def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
         data, [("xyz", "<f4", 3), ("n", "<f4", 3), ("rgb", "u1", 3)], count, start
     )
     assert np.median(np.abs(np.linalg.norm(vertex["xyz"], axis=1) - 1)) < 0.05
-    assert (vertex["rgb"][:, 0] > 150).mean() > 0.9
-    assert (tmp_path / "mesh.glb").stat().st_size > 1000
+    assert (vertex["rgb"][:, 0] > 150).mean() > 0.9, "colours of the Gaussians"
+    assert "texture" in messages.decisions[1]
+    data = (tmp_path / "mesh.glb").read_bytes()
+    found = cv2.imdecode(np.frombuffer(data[data.index(b"\xff\xd8") :], np.uint8), 1)
+    assert np.abs(found.astype(int) - 90).max() <= 3, "colours of the photographs"
+
+
+def test_the_number_of_triangles_and_the_size_of_the_texture_are_options(tmp_path, ball, views):
+    config = Export(formats=("mesh",), mesh_voxel=0.05, mesh_faces=700, texture_px=100)
+    messages = write_rendered(tmp_path, config, ball, views, look(views), up=UP)
+    assert int(messages.decisions[0].split()[1]) == pytest.approx(700, rel=0.05)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    found = cv2.imdecode(np.frombuffer(data[data.index(b"\xff\xd8") :], np.uint8), 1)
+    assert max(found.shape) <= 100
+
+
+def test_confident_depths_of_multi_view_stereo_replace_rendered_ones(tmp_path, ball, views):
+    """In the unit of the Gaussians, with more weight; rendered ones are in the gaps."""
+    depth = np.full((80, 80), 4.2, np.float32)
+    confidence = np.full((80, 80), 0.9, np.float32)
+    confidence[:, :40] = 0.1
+    depth[:40], confidence[:40] = 0, 0
+    for view in views:
+        write_map(tmp_path, view.name, DenseMap(depth, np.zeros((80, 80, 3)), confidence))
+    renders = RenderCache(ball, views, look(views), tmp_path / "drawn")
+    rendered = {found.view.name: found for found in DepthMaps(renders)}
+    for found in DepthMaps(renders, tmp_path, 0.5):
+        other = rendered[found.view.name]
+        if found.view.mask is None:
+            assert np.allclose(found.depth[40:, 40:], 2.1, rtol=1e-3)
+        assert np.array_equal(found.depth[:40], other.depth[:40])
+        assert np.array_equal(found.depth[:, :40], other.depth[:, :40])
+        assert found.weight.min() == 1 and (found.weight[40:, 40:] > 4).all()
+        assert other.weight is None
 
 
 def test_no_surface_gives_a_warning_and_no_mesh(tmp_path, ball, views):

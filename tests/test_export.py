@@ -32,6 +32,7 @@ from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.blocks import Block, Partition
+from pipeline.scene.exposure import NO_GAINS
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
@@ -71,6 +72,7 @@ def scene(tmp_path: Path) -> Path:
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
     (scene / "train").mkdir()
     write_npz(scene / "train" / "gaussians.npz", sample(50))
+    NO_GAINS.write(scene / "train")
     up = np.array([[0.0, 0.0, 1.0]], np.float32)
     cloud = DenseCloud(np.array([[0, 1, 2]], np.float32), up, np.array([[1, 2, 3]], np.uint8))
     write_dense_cloud(scene / "dense", cloud)

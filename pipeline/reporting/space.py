@@ -6,6 +6,7 @@ The viewer is ``viewer/viewer.js``; the page holds it as one script, built befor
 from __future__ import annotations
 
 import base64
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,11 +16,13 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.reporting.data import SceneResults
+from pipeline.export.selection import subject_box
+from pipeline.reporting.data import SceneResults, TrainedScene
 from pipeline.reporting.depths import COLUMNS, DEPTH_RATIO, ROWS, coarse_depths, depth_codes
 from pipeline.reporting.fit import Packed, fit
 from pipeline.reporting.pictures import Embedded, embedded, shrunk, upright
 from pipeline.reporting.text import count
+from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
 
@@ -33,6 +36,9 @@ _POSTER = (1000, 80)
 # The scene's box is [-1, 1]; points within this multiple of it are stored as 16-bit integers.
 _REACH = 4.0
 _STEP = _REACH / 32767
+# Steps of the box to crop with in the longest side of the subject, at least, and how far it can be
+# moved from there, in multiples of that side.
+_CROP_STEPS, _CROP_REACH = 200, 2.0
 # Radii of scenes that SPZ represents well: scales from e^-10 to e^5.9, position steps of 2^-20.
 _SPZ_RADII = (0.1, 100.0)
 
@@ -136,9 +142,9 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
         of the initial camera, or null; ``points``: base64 of int16 (P, 3), little-endian, in
         the page's frame in units of ``step``; ``colours``: base64 of uint8 (P, 3); ``size`` of a
         camera; ``unit``: ``name`` of the unit of the exported Gaussians, and ``scale``, the number
-        of them in one unit of the world; ``depths``: ``codes``, base64 of the ``depth_codes`` of
-        each camera, ``rows`` and ``columns``, and ``first`` (the page's unit) and ``ratio``, which
-        decode them.
+        of them in one unit of the world; ``crop``: as from ``_crop``; ``depths``: ``codes``, base64
+        of the ``depth_codes`` of each camera, ``rows`` and ``columns``, and ``first`` (the page's
+        unit) and ``ratio``, which decode them.
     """
     scene, points = results.trained, results.points
     cameras = [upright_camera(v, scene.orientations.get(v.name, 1)) for v in scene.views]
@@ -174,6 +180,7 @@ def viewer_data(results: SceneResults) -> dict[str, Any]:
             "name": "m" if scene.is_metric else "scene units",
             "scale": 1 / scene.normalization.scale,
         },
+        "crop": _crop(scene),
         "depths": {
             "rows": ROWS,
             "columns": COLUMNS,
@@ -229,6 +236,32 @@ def _robust_box(xyz: Array, centres: Array) -> tuple[Array, float]:
     reach = [np.percentile(np.linalg.norm(v - middle, axis=1), share) for v, share in groups]
     radius = float(max(reach))
     return middle, radius if radius > 0 else 1.0
+
+
+def _crop(scene: TrainedScene) -> dict[str, Any]:
+    """The box to start cropping with, in the frame and unit of exported files.
+
+    Returns:
+        ``box``: the corners of the subject, as in ``export.region``; ``bounds``: those that it can
+        have; ``step`` between positions.
+    """
+    try:
+        box = np.array(subject_box(scene.gaussians, scene.views))
+    except UserError:
+        box = np.quantile(scene.gaussians.means, [0.05, 0.95], axis=0).ravel()
+    low, high = box.reshape(2, 3) / scene.normalization.scale
+    ends = np.quantile(scene.gaussians.means, [0.002, 0.998], axis=0) / scene.normalization.scale
+    span = float((high - low).max()) or 1.0
+    digits = -math.floor(math.log10(span / _CROP_STEPS))
+    step = 10.0**-digits
+    low, high = np.floor(low / step) * step, np.ceil(high / step) * step
+    first = np.minimum(low, np.maximum(np.floor(ends[0] / step) * step, low - _CROP_REACH * span))
+    last = np.maximum(high, np.minimum(np.ceil(ends[1] / step) * step, high + _CROP_REACH * span))
+    return {
+        "box": np.round([*low, *high], digits).tolist(),
+        "bounds": np.round([*first, *last], digits).tolist(),
+        "step": step,
+    }
 
 
 def upright_frame(rotations: Array, up: Array | None = None) -> Array:

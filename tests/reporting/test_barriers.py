@@ -45,6 +45,8 @@ def test_axe_finds_no_barrier_and_the_scene_is_on_the_first_screen(
                 "name => document.querySelector(name).getBoundingClientRect().bottom)"
             )
             assert max(tops) <= 844 and tops[0] > 844 / 2
+            for name in ("Measure", "Crop"):
+                page.get_by_role("button", name=name, exact=True).click()
         page.evaluate(AXE.read_text("utf-8"))
         found = page.evaluate("axe.run()")["violations"]
         assert [(v["id"], [node["html"] for node in v["nodes"]]) for v in found] == []

@@ -24,6 +24,7 @@ CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 
 import * as THREE from "three";
 import { Comparison, place } from "./compare.js";
+import { Crop } from "./crop.js";
 import { Frusta } from "./frusta.js";
 import { Gestures } from "./gestures.js";
 import { Coverage } from "./limits.js";
@@ -32,13 +33,14 @@ import { Orbit } from "./orbit.js";
 import { bytes, poseInPage, Stage } from "./stage.js";
 
 const OVERVIEW = { width: 100, height: 100, fx: 107, fy: 107, cx: 50, cy: 50 }; // 50 degrees
-const CROP = 1.4; // an image of another shape than the canvas is enlarged by this at most
+const LARGER = 1.4; // an image of another shape than the canvas is enlarged by this at most
 const FADE_OUT = [0.05, 0.4]; // distances from the hull at which far content starts and ends fading
 const FOCUS_SHARE = 0.7; // of the distance, after a double click
 const PIVOT_REACH = 2; // one orbits points within this multiple of the scene's reach
 const HINT_MS = 1800;
 
 const box = document.getElementById("space");
+const panel = box.querySelector(".crop");
 const tools = document.getElementById("space-tools");
 const message = box.querySelector(".message");
 
@@ -72,7 +74,8 @@ function start(data) {
   frusta.visible = tools.elements.cameras.checked;
   const measure = new Measure(
     box.querySelector(".measured"), data.unit.scale / frame.getMaxScaleOnAxis(), data.unit.name);
-  stage.scene.add(frusta, measure);
+  const crop = new Crop(panel, data.crop, data.unit.scale, frame, (...corners) => stage.crop(...corners));
+  stage.scene.add(frusta, measure, crop);
   let lens = OVERVIEW; // the pinhole whose image fills the canvas
   let current = null; // the index of the camera that was shown last, or null for the overview
 
@@ -98,7 +101,7 @@ function start(data) {
     const { clientWidth, clientHeight } = box, { width, height, fx, fy } = lens;
     const fits = [clientWidth * fx / width, clientHeight * fy / height];
     const whole = Math.min(...fits);
-    return Math.min(Math.sqrt(whole * Math.max(...fits)), CROP * whole);
+    return Math.min(Math.sqrt(whole * Math.max(...fits)), LARGER * whole);
   }
 
   function resize() {
@@ -236,6 +239,10 @@ function start(data) {
     setMeasuring(!measure.active);
     if (measure.active) canvas.focus({ preventScroll: true });
   });
+  button.crop.addEventListener("click", () => {
+    crop.activate(!crop.visible);
+    button.crop.setAttribute("aria-pressed", crop.visible);
+  });
   box.addEventListener("keydown", event => {
     if (event.key === "Escape") setMeasuring(false);
   });
@@ -280,6 +287,7 @@ function start(data) {
       pose: camera.matrixWorld.toArray(), pivot: orbit.pivot.toArray(), fov: camera.fov, aspect: camera.aspect,
       near: camera.near, fade: stage.fade.value, active: gestures.active, current,
       photograph: comparison.camera?.name ?? null, lengths: measure.lengths,
+      crop: crop.visible ? crop.box.map(Number) : null,
     };
   }
 

@@ -54,6 +54,7 @@ export class Stage {
     });
     frame.decompose(this.splats.position, this.splats.quaternion, this.splats.scale);
     this.#fadeOutside();
+    this.#hideOutsideBox();
     this.points = sparsePoints(data);
     this.points.visible = false;
     this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
@@ -80,6 +81,30 @@ export class Stage {
     this.splats.updateVersion();
   }
 
+  // An object modifier's coordinates are the world's.
+  #hideOutsideBox() {
+    const corner = value => new dyno.DynoVec3({ value: new THREE.Vector3().setScalar(value) });
+    this.low = corner(-Infinity);
+    this.high = corner(Infinity);
+    this.splats.objectModifier = dyno.dynoBlock(
+      { gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+        const { center, opacity } = dyno.splitGsplat(gsplat).outputs;
+        const inside = dyno.and(dyno.all(dyno.lessThanEqual(this.low, center)),
+          dyno.all(dyno.lessThanEqual(center, this.high)));
+        const shown = dyno.select(inside, opacity, dyno.dynoConst("float", 0));
+        return { gsplat: dyno.combineGsplat({ gsplat, opacity: shown }) };
+      });
+  }
+
+  // Hide the Gaussians outside a box, bounds included, world. Returns the number that is shown.
+  crop(low = [-Infinity, -Infinity, -Infinity], high = [Infinity, Infinity, Infinity]) {
+    this.low.value.fromArray(low);
+    this.high.value.fromArray(high);
+    this.splats.updateVersion();
+    this.redraw();
+    return this.#surface().count(this.isShown);
+  }
+
   redraw() {
     if (this.requested || this.busy) return;
     this.requested = true;
@@ -98,12 +123,22 @@ export class Stage {
     this.redraw();
   }
 
+  // Once the Gaussians are there.
+  #surface() {
+    return this.seen ??= new Surface(this.splats);
+  }
+
+  // Whether a Gaussian with this mean, world, is in the box.
+  isShown = (x, y, z) => {
+    const { low: { value: low }, high: { value: high } } = this;
+    return low.x <= x && x <= high.x && low.y <= y && y <= high.y && low.z <= z && z <= high.z;
+  };
+
   // The point of the surface at a position on the canvas, in normalised device coordinates: at the
   // median distance along nine rays around it, `spread` apart. null if less than half of them meet
   // the surface, or if it is farther than `reach` from the scene's centre.
   surface(x, y, spread, reach = Infinity) {
     const { camera, coverage, near } = this;
-    this.seen ??= new Surface(this.splats);
     this.splats.updateMatrixWorld();
     const steps = [[0, 0], [-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
     const rays = steps.map(([i, j]) => {
@@ -112,7 +147,8 @@ export class Stage {
       return caster.ray;
     });
     const pixel = 2 * Math.tan(THREE.MathUtils.degToRad(camera.fov / 2)) / this.canvas.clientHeight;
-    const depths = this.seen.depths(rays, near, pixel, () => true).filter(depth => depth !== null);
+    const depths = this.#surface()
+      .depths(rays, near, pixel, this.isShown).filter(depth => depth !== null);
     if (depths.length < 5) return null;
     depths.sort((a, b) => a - b);
     const point = rays[0].at(depths[depths.length >> 1], new THREE.Vector3());

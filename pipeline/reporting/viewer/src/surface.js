@@ -20,6 +20,14 @@ export class Surface {
       index * NUMBERS));
   }
 
+  // The number of Gaussians that count, by `isShown` as below.
+  count(isShown) {
+    let found = 0;
+    for (let at = 0; at < this.values.length; at += NUMBERS)
+      found += isShown(this.values[at], this.values[at + 1], this.values[at + 2]);
+    return found;
+  }
+
   // The distance along each ray at which the share ABSORBED of its light is; null for rays of which
   // less is. A ray meets a Gaussian where the Gaussian's density along it is largest. `rays` have one
   // origin and about one direction; `pixel` is the angle that a pixel spans. `isShown(x, y, z)` says

@@ -140,7 +140,7 @@ def measure(setup: Setup, world: str, seed: int) -> LightResult:
     start = time.perf_counter()
     with TemporaryDirectory() as scratch:
         run = TrainingRun(options, Path(scratch), seed=seed, threads=threads)
-        trained = train_scene(scene, _initial(scene, seed), run)
+        trained = train_scene(scene, initial(scene, seed), run)
     seconds = time.perf_counter() - start
     gaussians, appearance = trained.result.gaussians, trained.result.appearance
     protocol = choose_protocol(scene.views, Split(), options)
@@ -179,7 +179,8 @@ def measure(setup: Setup, world: str, seed: int) -> LightResult:
     )
 
 
-def _initial(scene: SceneData, seed: int) -> Gaussians:
+def initial(scene: SceneData, seed: int) -> Gaussians:
+    """The Gaussians that training starts with."""
     training = [view for view in scene.views if not view.is_test]
     points = InitPoints(scene.model.points)
     first = first_gaussians(points, training, Init(), InitExperiments(), seed)

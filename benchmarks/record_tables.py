@@ -23,6 +23,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LevelResult,
     LightResult,
     MemoryResult,
     NovelViewResult,
@@ -93,6 +94,20 @@ def light(found: Sequence[LightResult]) -> str:
         values = (f"{r.psnr:.2f}", f"{r.psnr_right:.2f}", cell(difference, "+.2f"))
         others = (f"{r.psnr_own:.2f}", cell(r.psnr_withheld, ".2f"), f"{r.seconds:.0f}")
         rows.append([r.world, str(r.seed), r.pixels, str(r.steps), chosen, *values, *others])
+    return markdown.table(rows)
+
+
+def levels(found: Sequence[LevelResult]) -> str:
+    """One row for each level; distances in median depths of the test views."""
+    rows = [
+        [
+            *("level", "Gaussians", "distance of a pixel (median depths)", "pixels there"),
+            *("PSNR there (dB)", "pixels of the views", "PSNR in the views (dB)"),
+        ]
+    ]
+    for r in found:
+        far = (f"{r.distance / r.depth:.2f}", r.pixels, cell(r.psnr, ".2f"))
+        rows.append([str(r.level), str(r.gaussians), *far, r.near_pixels, cell(r.psnr_near, ".2f")])
     return markdown.table(rows)
 
 
@@ -280,6 +295,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "budget-curves": (BudgetResult, budget_tables.curves),
     "novel_views": (NovelViewResult, novel_views),
     "light": (LightResult, light),
+    "levels": (LevelResult, levels),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

@@ -32,7 +32,7 @@ LEVELS = 5
 #: The largest number of Gaussians of a leaf.
 LEAF = 1 << 14
 #: The largest number of Gaussians of a file.
-FILE = 1 << 17
+FILE = 1 << 16
 
 
 class Bound(JsonObject):
@@ -192,5 +192,6 @@ def _bound(boxes: NDArray[np.float64]) -> Bound:
 
 
 def _triple(values: NDArray[np.float64]) -> Vector3:
-    x, y, z = values.tolist()
+    """With as many digits as float32 has: a large scene has tens of thousands of boxes."""
+    x, y, z = (float(f"{value:.7g}") for value in values.tolist())
     return x, y, z

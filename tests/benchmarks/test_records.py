@@ -19,6 +19,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LevelResult,
     LightResult,
     MemoryResult,
     NovelViewResult,
@@ -101,6 +102,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
             *(30.0, 29.5, 30.0, None, 61.2),
         ),
         "| plain | 0 | 240x180 | 1500 | none | 30.00 | 29.50 | +0.00 | 30.00 | - | 61 |",
+    ),
+    "levels": (
+        LevelResult(2, 5000, 6, 4.0, 0.03, 8.0, "160x120", 35.25, "320x240", 30.5),
+        "| 2 | 5000 | 2.00 | 160x120 | 35.25 | 320x240 | 30.50 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

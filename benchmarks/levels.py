@@ -1,0 +1,154 @@
+"""What the levels of detail of Streamed SOG lose, at the distance at which a viewer shows them.
+
+    python -m benchmarks.levels --json RECORD.json
+
+The scene is the demo's, trained as by ``benchmarks.light`` with exact poses. A level belongs to the
+distance at which the mean distance of its Gaussians to their nearest neighbour is one pixel. Test
+views show the scene from there without a change of perspective: at the size in pixels that makes
+the median distance of the Gaussians from the camera the level's. The levels are rendered in
+float32; what SOG's compression loses is not included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.light import Setup, initial, read_scene, write_world
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.record_tables import levels
+from benchmarks.results import LevelResult
+from pipeline.config.schema import Split
+from pipeline.demo.options import picture_size
+from pipeline.io.streamed_sog import LEAF, LEVELS
+from pipeline.metrics.image import psnr
+from pipeline.metrics.protocol import choose_protocol
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_rgb, to_bytes
+from pipeline.runtime.machine import usable_cores
+from pipeline.scene.views import View
+from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianRows, collect
+from pipeline.splats.chunks import Chunk, chunks_of, levels_of
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.run import TrainingRun
+from pipeline.training.scene import train_scene
+
+
+def whole_levels(gaussians: GaussianArrays) -> list[GaussianArrays]:
+    """The levels of a scene, of all leaves, as ``write_streamed_sog`` makes them."""
+
+    def leaves(chunk: Chunk) -> list[Chunk]:
+        return [leaf for child in chunk.children for leaf in leaves(child)] or [chunk]
+
+    tree = chunks_of(gaussians.means, np.arange(len(gaussians)), LEAF)
+    parts = [
+        list(levels_of(collect(GaussianRows(gaussians, leaf.rows, gaussians.sh_degree)), LEVELS))
+        for leaf in leaves(tree)
+    ]
+    return [
+        GaussianArrays(**{n: np.concatenate([getattr(p, n) for p in level]) for n in NAMES})
+        for level in zip(*parts, strict=True)
+    ]
+
+
+def spacing_of(gaussians: GaussianArrays) -> float:
+    """The mean distance of a Gaussian to its nearest neighbour."""
+    from scipy.spatial import cKDTree
+
+    return float(cKDTree(gaussians.means).query(gaussians.means, k=2)[0][:, 1].mean())
+
+
+def depth_of(gaussians: GaussianArrays, views: Sequence[View]) -> float:
+    """The median depth of the Gaussians that are inside the images."""
+    depths = []
+    for view in views:
+        x, y, z = view.world_to_camera[:3, :3] @ gaussians.means.T + view.world_to_camera[:3, 3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+        inside = (z > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
+        depths.append(z[inside])
+    return float(np.median(np.concatenate(depths)))
+
+
+def resized(view: View, factor: float) -> View:
+    """The view with ``factor`` times the pixels along each axis, at least one."""
+    width, height = (max(1, round(size * factor)) for size in (view.width, view.height))
+    x, y = width / view.width, height / view.height
+    intrinsics = {"fx": view.fx * x, "cx": view.cx * x, "fy": view.fy * y, "cy": view.cy * y}
+    return replace(view, width=width, height=height, **intrinsics)
+
+
+def agreement(
+    level: GaussianArrays, full: GaussianArrays, views: Sequence[View], options: RasterOptions
+) -> float:
+    """The mean PSNR of renders of a level against those of all Gaussians, dB."""
+    found = []
+    for view in views:
+        images = (to_bytes(render_rgb(Gaussians.sharing(g), view, options)) for g in (level, full))
+        found.append(psnr(*images))
+    return float(np.mean(found))
+
+
+def measure(setup: Setup, seed: int) -> list[LevelResult]:
+    """Train the demo scene and measure its levels."""
+    scene, options = read_scene(write_world(setup, "plain", seed)), setup.options()
+    threads = usable_cores()
+    with TemporaryDirectory() as scratch:
+        run = TrainingRun(options, Path(scratch), seed=seed, threads=threads)
+        trained = train_scene(scene, initial(scene, seed), run)
+    full = trained.result.gaussians.as_arrays()
+    raster = choose_protocol(scene.views, Split(), options).options(options, threads)
+    views = [view for view in scene.views if view.is_test]
+    depth, found = depth_of(full, views), []
+    for number, level in enumerate(whole_levels(full)):
+        spacing = spacing_of(level)
+        distance = views[0].fx * spacing
+        far = [resized(view, depth / distance) for view in views]
+        found.append(
+            LevelResult(
+                level=number,
+                gaussians=len(level),
+                views=len(views),
+                depth=depth,
+                spacing=spacing,
+                distance=distance,
+                pixels=f"{far[0].width}x{far[0].height}",
+                psnr=agreement(level, full, far, raster) if number else None,
+                near_pixels=f"{views[0].width}x{views[0].height}",
+                psnr_near=agreement(level, full, views, raster) if number else None,
+            )
+        )
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.levels",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--size", type=picture_size, default=(240, 180), metavar="WIDTHxHEIGHT")
+    add("--views", type=int, default=48, help="photographs of the scene")
+    add("--steps", type=int, default=1500)
+    add("--gaussians", type=int, default=12_000, help="upper limit of their number")
+    add("--seed", type=int, default=0)
+    add("--work", type=Path, default=Path("build/light"), help="folder for the photographs")
+    add_record_options(parser)
+    asked = parser.parse_args(arguments)
+    setup = Setup(asked.size, asked.views, asked.steps, asked.gaussians, "none", asked.work)
+    found = measure(setup, asked.seed)
+    if asked.json is not None:
+        write_record(asked.json, measured("levels", asked.note, arguments), found)
+    print(levels(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -5,8 +5,9 @@
 The scene is the demo's, trained as by ``benchmarks.light`` with exact poses. A level belongs to the
 distance at which the mean distance of its Gaussians to their nearest neighbour is one pixel. Test
 views show the scene from there without a change of perspective: at the size in pixels that makes
-the median distance of the Gaussians from the camera the level's. The levels are rendered in
-float32; what SOG's compression loses is not included.
+the median distance of the Gaussians from the camera the level's. Renders are compared with those of all
+Gaussians at that size, and with those at the views' full size, averaged: small Gaussians look too
+thick from afar, since renderers widen them to a pixel. SOG's compression is not included.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from benchmarks.light import Setup, initial, read_scene, write_world
 from benchmarks.measured import add_record_options, measured, write_record
@@ -38,6 +41,8 @@ from pipeline.splats.chunks import Chunk, chunks_of, levels_of
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.run import TrainingRun
 from pipeline.training.scene import train_scene
+
+Images = list[NDArray[np.uint8]]
 
 
 def whole_levels(gaussians: GaussianArrays) -> list[GaussianArrays]:
@@ -84,15 +89,20 @@ def resized(view: View, factor: float) -> View:
     return replace(view, width=width, height=height, **intrinsics)
 
 
-def agreement(
-    level: GaussianArrays, full: GaussianArrays, views: Sequence[View], options: RasterOptions
-) -> float:
-    """The mean PSNR of renders of a level against those of all Gaussians, dB."""
-    found = []
-    for view in views:
-        images = (to_bytes(render_rgb(Gaussians.sharing(g), view, options)) for g in (level, full))
-        found.append(psnr(*images))
-    return float(np.mean(found))
+def renders(gaussians: GaussianArrays, views: Sequence[View], options: RasterOptions) -> Images:
+    return [to_bytes(render_rgb(Gaussians.sharing(gaussians), view, options)) for view in views]
+
+
+def averaged(images: Images, views: Sequence[View]) -> Images:
+    """The images at the sizes of the views, by the mean over the area of each pixel."""
+    sizes = [(view.width, view.height) for view in views]
+    pairs = zip(images, sizes, strict=True)
+    return [np.asarray(Image.fromarray(i).resize(s, Image.Resampling.BOX)) for i, s in pairs]
+
+
+def agreement(images: Images, references: Images) -> float:
+    """The mean PSNR, dB."""
+    return float(np.mean([psnr(a, b) for a, b in zip(images, references, strict=True)]))
 
 
 def measure(setup: Setup, seed: int) -> list[LevelResult]:
@@ -105,11 +115,12 @@ def measure(setup: Setup, seed: int) -> list[LevelResult]:
     full = trained.result.gaussians.as_arrays()
     raster = choose_protocol(scene.views, Split(), options).options(options, threads)
     views = [view for view in scene.views if view.is_test]
-    depth, found = depth_of(full, views), []
+    depth, found, near = depth_of(full, views), [], renders(full, views, raster)
     for number, level in enumerate(whole_levels(full)):
         spacing = spacing_of(level)
         distance = views[0].fx * spacing
         far = [resized(view, depth / distance) for view in views]
+        made = renders(level, far, raster)
         found.append(
             LevelResult(
                 level=number,
@@ -119,9 +130,10 @@ def measure(setup: Setup, seed: int) -> list[LevelResult]:
                 spacing=spacing,
                 distance=distance,
                 pixels=f"{far[0].width}x{far[0].height}",
-                psnr=agreement(level, full, far, raster) if number else None,
+                psnr=agreement(made, renders(full, far, raster)) if number else None,
+                psnr_averaged=agreement(made, averaged(near, far)),
                 near_pixels=f"{views[0].width}x{views[0].height}",
-                psnr_near=agreement(level, full, views, raster) if number else None,
+                psnr_near=agreement(renders(level, views, raster), near) if number else None,
             )
         )
     return found

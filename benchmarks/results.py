@@ -430,8 +430,10 @@ class LevelResult:
         pixels: The size at which test views show the scene as from ``distance``.
         psnr: The mean PSNR of renders against those of all Gaussians at that size, in dB; None for
             level 0.
+        psnr_averaged: The same against renders of all Gaussians at the size of the test views, each
+            pixel the mean over its area.
         near_pixels: The size of the test views.
-        psnr_near: The same at the size of the test views.
+        psnr_near: As ``psnr``, at the size of the test views.
     """
 
     level: int
@@ -442,6 +444,7 @@ class LevelResult:
     distance: float
     pixels: str
     psnr: float | None
+    psnr_averaged: float
     near_pixels: str
     psnr_near: float | None
 

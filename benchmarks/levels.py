@@ -5,9 +5,9 @@
 The scene is the demo's, trained as by ``benchmarks.light`` with exact poses. A level belongs to the
 distance at which the mean distance of its Gaussians to their nearest neighbour is one pixel. Test
 views show the scene from there without a change of perspective: at the size in pixels that makes
-the median distance of the Gaussians from the camera the level's. Renders are compared with those of all
-Gaussians at that size, and with those at the views' full size, averaged: small Gaussians look too
-thick from afar, since renderers widen them to a pixel. SOG's compression is not included.
+the median distance of the Gaussians from the camera the level's. Renders are compared with those of
+all Gaussians at that size, and with those at the views' full size, averaged: small Gaussians look
+too thick from afar, since renderers widen them. SOG's compression is not included.
 """
 
 from __future__ import annotations

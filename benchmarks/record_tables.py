@@ -23,6 +23,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LevelResult,
     LightResult,
     MemoryResult,
     NovelViewResult,
@@ -112,6 +113,22 @@ def surface(found: Sequence[SurfaceResult]) -> str:
         times = (f"{r.mesh_s:.0f}", cell(r.texture_s, ".0f"))
         complete = f"{100 * r.completeness:.1f}"
         rows.append([r.depths, f"{r.triangles:,}", *errors, complete, *colours, *times])
+    return markdown.table(rows)
+
+
+def levels(found: Sequence[LevelResult]) -> str:
+    """One row for each level; distances in median depths of the test views."""
+    rows = [
+        [
+            *("level", "Gaussians", "distance of a pixel (median depths)", "pixels there"),
+            *("PSNR there (dB)", "against averaged pixels (dB)"),
+            *("pixels of the views", "PSNR in the views (dB)"),
+        ]
+    ]
+    for r in found:
+        far = (f"{r.distance / r.depth:.2f}", r.pixels, cell(r.psnr, ".2f"))
+        near = (f"{r.psnr_averaged:.2f}", r.near_pixels, cell(r.psnr_near, ".2f"))
+        rows.append([str(r.level), str(r.gaussians), *far, *near])
     return markdown.table(rows)
 
 
@@ -300,6 +317,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "novel_views": (NovelViewResult, novel_views),
     "light": (LightResult, light),
     "surface": (SurfaceResult, surface),
+    "levels": (LevelResult, levels),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

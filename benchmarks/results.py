@@ -454,6 +454,43 @@ class SurfaceResult:
     dense_s: float
 
 
+# ---- benchmarks.levels ----
+
+
+@dataclass(frozen=True)
+class LevelResult:
+    """A level of detail against all Gaussians, by ``benchmarks.levels``.
+
+    Attributes:
+        level: 0 is the finest, which is all Gaussians.
+        gaussians: The number of Gaussians of the level.
+        views: The number of test views.
+        depth: The median depth of the Gaussians in the test views, in scene units.
+        spacing: The mean distance of the level's Gaussians to their nearest neighbour, in scene
+            units.
+        distance: The distance at which ``spacing`` is one pixel of the test views.
+        pixels: The size at which test views show the scene as from ``distance``.
+        psnr: The mean PSNR of renders against those of all Gaussians at that size, in dB; None for
+            level 0.
+        psnr_averaged: The same against renders of all Gaussians at the size of the test views, each
+            pixel the mean over its area.
+        near_pixels: The size of the test views.
+        psnr_near: As ``psnr``, at the size of the test views.
+    """
+
+    level: int
+    gaussians: int
+    views: int
+    depth: float
+    spacing: float
+    distance: float
+    pixels: str
+    psnr: float | None
+    psnr_averaged: float
+    near_pixels: str
+    psnr_near: float | None
+
+
 # ---- benchmarks.pose_conventions ----
 
 PoseOutcome = Literal["agree", "named", "refused", "warned", "silent"]

@@ -151,7 +151,15 @@ class _Files:
         write_sog(path, self.gaussians, antialias=self.antialias)
 
     def write_streamed_sog(self, path: Path) -> None:
-        write_streamed_sog(path, self.gaussians, antialias=self.antialias)
+        # As for training, the sky is what is much farther from the cameras than the scene.
+        sky = Sky(np.array([view.centre for view in self.scene.views]))
+        write_streamed_sog(
+            path,
+            self.gaussians,
+            blocks=self.blocks,
+            sky=sky.contains(self.gaussians.source.means[self.gaussians.rows]),
+            antialias=self.antialias,
+        )
 
     def write_usd(self, path: Path) -> None:
         write_usd(path, self.gaussians, scene_up(self.scene.views, self.scene.manifest))

@@ -1,15 +1,16 @@
-"""Streamed SOG, version 1: a folder of chunks of the scene at several levels of detail.
+"""Streamed SOG, version 1: a folder of SOG files with the scene at several levels of detail.
 
-``lod-meta.json`` has a binary tree of boxes. Each leaf has a folder of SOG files for each level,
-``LEVEL_LEAF/``: level 0 has all Gaussians of the leaf, each further one half as many
-(``splats.levels``). Viewers load the levels that a camera needs. Source of the layout:
-developer.playcanvas.com, "Streamed SOG".
+``lod-meta.json`` has a tree of boxes. Each leaf has its Gaussians at each level: level 0 has all of
+them, each further one half as many (``splats.levels``). A file, ``LEVEL_NUMBER/meta.json``, holds
+one level of neighbouring leaves. Viewers load the files of the levels that a camera needs. The
+coarsest level of the whole scene is one file, which a viewer can show first. ``env/meta.json`` has
+what is always shown: the sky. Sources: developer.playcanvas.com, "Streamed SOG", and the engine's
+loader (``gsplat-octree.js``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,13 +22,17 @@ from pipeline.io.sog import write_sog
 from pipeline.io.sog_container import META, Asset
 from pipeline.runtime.atomic import write_text
 from pipeline.runtime.json_file import JsonObject, Vector3
-from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
-from pipeline.splats.chunks import LEAF, Rows, box, halves, in_z_order
-from pipeline.splats.levels import halved
+from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianRows, collect
+from pipeline.splats.chunks import Chunk, box, chunks_of, levels_of
 
 LOD_META = "lod-meta.json"
-#: The number of levels of detail; each has half of the Gaussians of the one before.
+ENVIRONMENT = f"env/{META}"
+#: The smallest number of levels of detail; each has half of the Gaussians of the one before.
 LEVELS = 5
+#: The largest number of Gaussians of a leaf.
+LEAF = 1 << 14
+#: The largest number of Gaussians of a file.
+FILE = 1 << 16
 
 
 class Bound(JsonObject):
@@ -51,89 +56,142 @@ class Part(JsonObject):
 
 
 class Node(JsonObject):
-    """A box of the tree: it has two children, or the levels of a leaf by number."""
+    """A box of the tree: it has children, or the levels of a leaf by number."""
 
     bound: Bound
-    children: tuple[Node, Node] | None = None
+    children: tuple[Node, ...] | None = None
     lods: dict[str, Part] | None = None
 
 
 class LodMeta(JsonObject):
-    """``lod-meta.json``."""
+    """``lod-meta.json``. The counts are without the environment."""
 
     version: Literal[1] = 1
     asset: Asset
     count: int = Field(ge=1)
     counts: tuple[int, ...]
     lodLevels: int = Field(ge=1)
+    environment: str | None = None
     filenames: tuple[str, ...]
     tree: Node
 
 
-@dataclass
-class _Written:
-    """The files and counts of the leaves that were written."""
-
-    filenames: list[str]
-    counts: list[int]
-
-
-def write_streamed_sog(folder: Path, gaussians: GaussianRows, *, antialias: bool = False) -> None:
-    """Write Gaussians as Streamed SOG: the leaves one after the other, then ``lod-meta.json``.
+def write_streamed_sog(
+    folder: Path,
+    gaussians: GaussianRows,
+    *,
+    blocks: NDArray[np.intp] | None = None,
+    sky: NDArray[np.bool_] | None = None,
+    antialias: bool = False,
+) -> None:
+    """Write Gaussians as Streamed SOG, leaf by leaf, then ``lod-meta.json``. Beside ``gaussians``,
+    memory holds up to one unfinished file of each level.
 
     Args:
         folder: The folder, which is made.
         gaussians: The Gaussians, at least one, in the world's axes.
+        blocks: (N,) the number of the block of each of ``gaussians``: the first branches of the
+            tree. None for one block.
+        sky: (N,) whether each is always shown, without levels. It is ignored where these are more
+            than a file holds, or all.
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
     """
-    written = _Written([], [0] * LEVELS)
-    tree = _write_node(folder, gaussians, gaussians.rows, written, antialias)
+    environment = None
+    if sky is not None and 0 < sky.sum() <= min(FILE, len(gaussians) - 1):
+        environment = ENVIRONMENT
+        part = replace(gaussians, rows=gaussians.rows[sky])
+        write_sog(folder / environment, part, antialias=antialias)
+        gaussians = replace(gaussians, rows=gaussians.rows[~sky])
+        blocks = None if blocks is None else blocks[~sky]
+    tree = chunks_of(gaussians.source.means, gaussians.rows, LEAF, blocks)
+    files = _Files(folder, antialias, [_Level() for _ in range(_num_levels(len(gaussians)))])
+    root = _write_node(gaussians, tree, files)
+    for level in range(len(files.levels)):
+        files.flush(level)
+    counts = tuple(level.written for level in files.levels)
     meta = LodMeta(
         asset=Asset(generator="splatmake"),
-        count=sum(written.counts),
-        counts=tuple(written.counts),
-        lodLevels=LEVELS,
-        filenames=tuple(written.filenames),
-        tree=tree,
+        count=sum(counts),
+        counts=counts,
+        lodLevels=len(counts),
+        environment=environment,
+        filenames=tuple(files.names),
+        tree=root,
     )
     write_text(folder / LOD_META, meta.model_dump_json(exclude_none=True))
 
 
-def _write_node(
-    folder: Path, gaussians: GaussianRows, rows: Rows, written: _Written, antialias: bool
-) -> Node:
-    if len(rows) > LEAF:
-        parts = halves(gaussians.source.means, rows)
-        first, second = (_write_node(folder, gaussians, p, written, antialias) for p in parts)
-        bounds = np.array([[node.bound.min, node.bound.max] for node in (first, second)])
-        bound = _bound(bounds[:, 0].min(0), bounds[:, 1].max(0))
-        return Node(bound=bound, children=(first, second))
-    number, lods = len(written.filenames) // LEVELS, {}
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for level, made in enumerate(_levels(collect(replace(gaussians, rows=rows)))):
-        name = f"{level}_{number}/{META}"
-        write_sog(folder / name, made, antialias=antialias)
-        corners = box(made, 1.0)
-        low, high = np.minimum(low, corners[0]), np.maximum(high, corners[1])
-        lods[str(level)] = Part(file=len(written.filenames), offset=0, count=len(made))
-        written.filenames.append(name)
-        written.counts[level] += len(made)
-    return Node(bound=_bound(low, high), lods=lods)
+def _num_levels(count: int) -> int:
+    """As many levels as make the coarsest one half of a file, which leaves room for rounding."""
+    return max(LEVELS, 1 + (2 * count // FILE).bit_length())
 
 
-def _levels(gaussians: GaussianArrays) -> Iterator[GaussianArrays]:
-    """The levels of a leaf from the finest, in Morton order."""
-    for level in range(LEVELS):
-        if level:
-            gaussians = halved(gaussians)
-        gaussians = in_z_order(gaussians)
-        yield gaussians
+@dataclass
+class _Level:
+    """The file of a level that is being filled: the leaves in it, its index in the list of files,
+    and the number of Gaussians of the level so far."""
+
+    parts: list[GaussianArrays] = field(default_factory=list)
+    file: int = -1
+    number: int = -1
+    written: int = 0
+
+    @property
+    def count(self) -> int:
+        return sum(map(len, self.parts))
 
 
-def _bound(low: NDArray[np.float64], high: NDArray[np.float64]) -> Bound:
-    return Bound(min=_triple(low), max=_triple(high))
+@dataclass
+class _Files:
+    """The files of all levels."""
+
+    folder: Path
+    antialias: bool
+    levels: list[_Level]
+    names: list[str] = field(default_factory=list)
+
+    def add(self, level: int, gaussians: GaussianArrays) -> Part:
+        """Add a leaf to the file of a level, or to a new one where it is full."""
+        state = self.levels[level]
+        if state.parts and state.count + len(gaussians) > FILE:
+            self.flush(level)
+        if not state.parts:
+            state.file, state.number = len(self.names), state.number + 1
+            self.names.append(f"{level}_{state.number}/{META}")
+        part = Part(file=state.file, offset=state.count, count=len(gaussians))
+        state.parts.append(gaussians)
+        state.written += len(gaussians)
+        return part
+
+    def flush(self, level: int) -> None:
+        """Write the unfinished file of a level."""
+        state = self.levels[level]
+        arrays = {n: np.concatenate([getattr(p, n) for p in state.parts]) for n in NAMES}
+        state.parts.clear()
+        path = self.folder / self.names[state.file]
+        write_sog(path, GaussianArrays(**arrays), antialias=self.antialias)
+
+
+def _write_node(gaussians: GaussianRows, chunk: Chunk, files: _Files) -> Node:
+    if chunk.children:
+        children = tuple(_write_node(gaussians, child, files) for child in chunk.children)
+        bounds = np.array([[node.bound.min, node.bound.max] for node in children])
+        return Node(bound=_bound(bounds), children=children)
+    lods: dict[str, Part] = {}
+    boxes: list[NDArray[np.float64]] = []
+    leaf = collect(replace(gaussians, rows=chunk.rows))
+    for level, made in enumerate(levels_of(leaf, len(files.levels))):
+        boxes.append(box(made, 1.0))
+        lods[str(level)] = files.add(level, made)
+    return Node(bound=_bound(np.array(boxes)), lods=lods)
+
+
+def _bound(boxes: NDArray[np.float64]) -> Bound:
+    """The box around (N, 2, 3) boxes."""
+    return Bound(min=_triple(boxes[:, 0].min(0)), max=_triple(boxes[:, 1].max(0)))
 
 
 def _triple(values: NDArray[np.float64]) -> Vector3:
-    x, y, z = values.tolist()
+    """With as many digits as float32 has: a large scene has tens of thousands of boxes."""
+    x, y, z = (float(f"{value:.7g}") for value in values.tolist())
     return x, y, z

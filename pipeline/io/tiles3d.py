@@ -20,12 +20,14 @@ from pipeline.io.gltf import GAUSSIAN_SPLATTING, glb, splat_rendering
 from pipeline.io.spz import encode_spz
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect, joined
-from pipeline.splats.chunks import LEAF, Rows, box, halves, in_z_order
+from pipeline.splats.chunks import Chunk, box, chunks_of, in_z_order
 from pipeline.splats.levels import halved
 
 Array = NDArray[np.float64]
 
 TILESET = "tileset.json"
+#: The largest number of Gaussians of a tile.
+LEAF = 1 << 17
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
 _EXTENSIONS = [GAUSSIAN_SPLATTING, _SPZ]
 #: The half sides of the box of a Gaussian, in standard deviations.
@@ -53,16 +55,16 @@ class _Writer:
     antialias: bool
     written: int = field(default=0)
 
-    def write(self, rows: Rows) -> tuple[dict[str, Any], GaussianArrays, Array]:
-        """Write the tile of the Gaussians ``rows``, and those below it.
+    def write(self, chunk: Chunk) -> tuple[dict[str, Any], GaussianArrays, Array]:
+        """Write the tile of a chunk, and those below it.
 
         Returns:
             The tile's entry in the tree; its Gaussians; (2, 3) corners of a box of the tile and
             those below it, world.
         """
         children: list[dict[str, Any]] = []
-        if len(rows) > LEAF:
-            parts = [self.write(part) for part in halves(self.gaussians.source.means, rows)]
+        if chunk.children:
+            parts = [self.write(child) for child in chunk.children]
             children = [entry for entry, *_ in parts]
             own = halved(joined([gaussians for _, gaussians, _ in parts]))
             boxes = [corners for *_, corners in parts]
@@ -72,7 +74,7 @@ class _Writer:
                 *(1.25 * entry["geometricError"] for entry in children),
             )
         else:
-            own, boxes, error = collect(replace(self.gaussians, rows=rows)), [], 0.0
+            own, boxes, error = collect(replace(self.gaussians, rows=chunk.rows)), [], 0.0
         corners = np.stack([box(own, _REACH), *boxes])
         corners = np.stack([corners[:, 0].min(0), corners[:, 1].max(0)])
         own = in_z_order(own)
@@ -100,7 +102,8 @@ def write_tiles3d(
         to_earth: (4, 4) affine transformation of the world to Earth-centred coordinates, metres.
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
     """
-    root, _, corners = _Writer(folder, gaussians, antialias).write(gaussians.rows)
+    tree = chunks_of(gaussians.source.means, gaussians.rows, LEAF)
+    root, _, corners = _Writer(folder, gaussians, antialias).write(tree)
     turned = np.eye(4)
     turned[:3, :3] = _TILE_OF_WORLD.T
     root["transform"] = (to_earth @ turned).T.ravel().tolist()

@@ -14,7 +14,6 @@ from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
-from pipeline.splats.chunks import LEAF
 
 # MB of a process of Python with numpy and OpenCV or pycolmap; with numpy alone; with torch; with
 # torch and the rasterizer's kernels.
@@ -29,8 +28,8 @@ _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
 # Bytes per Gaussian that is held; that is held and rendered; that is rendered with gradients; that
 # is held, read again from a compressed file and rendered.
 _HELD, _RENDERED, _PARTITIONED, _READ_AGAIN = 250.0, 400.0, 720.0, 1250.0
-# MB for the levels of detail of a chunk, when it has its largest number of Gaussians.
-_LEVELS = 260.0
+# MB for the levels of detail of a chunk, at its largest number of Gaussians.
+_LEVELS, _CHUNK = 260.0, 1 << 17
 # Bytes per pixel of a rendered view; of a view measured in one thread. MB of a thread's band.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # MB of the report's page with its parts, and of a mesh.
@@ -250,7 +249,7 @@ def _export(plan: Plan, threads: int) -> float:
     rendered = RENDERED_FORMATS.intersection(export.formats)
     selected = export.max_gaussians is not None or export.region is not None
     if not {"sog_lod", "tiles3d"}.isdisjoint(export.formats):
-        written += _LEVELS * min(1.0, 1e6 * _gaussians(plan) / LEAF)
+        written += _LEVELS * min(1.0, 1e6 * _gaussians(plan) / _CHUNK)
     needed = [written]
     if not set(LOSSY_FORMATS).isdisjoint(export.formats):
         read = _READ_AGAIN * min(_gaussians(plan), MAX_MEASURED_LOSSES / 1e6)

@@ -19,6 +19,7 @@ from benchmarks.results import (
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
+    LevelResult,
     LightResult,
     MemoryResult,
     NovelViewResult,
@@ -109,6 +110,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
             *(12.0, 40.0, 60.0, 80.0),
         ),
         "| both | 20,000 | 3.1 | 2.4 | 12.3 | 95.7 | 25.0 | 28.9 | 1200 | 12 | 40 |",
+    ),
+    "levels": (
+        LevelResult(2, 5000, 6, 4.0, 0.03, 8.0, "160x120", 35.25, 33.5, "320x240", 30.5),
+        "| 2 | 5000 | 2.00 | 160x120 | 35.25 | 33.50 | 320x240 | 30.50 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

@@ -19,8 +19,8 @@ from pipeline.geometry.geodesy import enu_axes, to_ecef
 from pipeline.io.tiles3d import write_tiles3d
 from pipeline.splats.arrays import GaussianArrays, GaussianRows
 from pipeline.splats.init import SH_C0
+from tests.browser import SECONDS, browser
 from tests.io.test_independent import HERE, needs_node
-from tests.reporting.test_viewer import SECONDS, browser
 
 __all__ = ["browser"]
 

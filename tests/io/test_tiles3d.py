@@ -14,7 +14,6 @@ from pipeline.io.placement import to_earth
 from pipeline.io.spz import decode_spz
 from pipeline.io.tiles3d import write_tiles3d
 from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Georeference
-from pipeline.splats import chunks
 from pipeline.splats.arrays import GaussianRows
 from tests.splats.samples import sample
 
@@ -77,7 +76,6 @@ def test_other_frames_have_no_place(method):
 def tiles(tmp_path, monkeypatch):
     """A scene of 1,000 Gaussians in tiles of up to 150, placed by a known matrix."""
     monkeypatch.setattr(tiles3d, "LEAF", 150)
-    monkeypatch.setattr(chunks, "LEAF", 150)
     gaussians = sample(1000, 1).as_arrays()
     matrix = to_earth(
         georeference(

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.reporting.index import Batch, index_html
 from pipeline.reporting.page import write_report
+from tests.browser import SECONDS, browser
 from tests.reporting.made import report, trained
 from tests.reporting.test_batch import BATCH
-from tests.reporting.test_viewer import SECONDS, browser
 
 __all__ = ["browser"]
 

@@ -16,8 +16,9 @@ from pipeline.reporting.page import write_report
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
+from tests.browser import browser
 from tests.reporting.made import report
-from tests.reporting.test_viewer import browser, page, state
+from tests.reporting.test_viewer import page, state
 from tests.reporting.worlds import look_at
 
 __all__ = ["browser", "page"]

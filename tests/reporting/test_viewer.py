@@ -6,7 +6,6 @@ import base64
 import dataclasses
 import io
 import re
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,35 +24,13 @@ from pipeline.reporting.space import upright_camera
 from pipeline.splats.arrays import collect
 from pipeline.splats.axes import RUB, Flipped
 from pipeline.splats.gaussians import Gaussians
+from tests.browser import SECONDS, browser
 from tests.reporting.made import gaussians, report, trained
 from tests.reporting.worlds import WORLDS, World
-from tests.tools import need_package
 
-FLAGS = (
-    *("--headless=new", "--no-sandbox", "--no-first-run"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-)
-NAMES = ("chromium", "chromium-browser", "chromium-headless-shell", "chrome", "google-chrome")
-CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-SECONDS = 180.0  # a browser on a busy machine; a page is there within one or two on an idle one
+__all__ = ["browser"]
 
 Pixels = NDArray[np.uint8]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    need_package("playwright")
-    if CHROMIUM is None:
-        pytest.skip("not run: no Chromium (apt-get install chromium)")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM, args=FLAGS, timeout=1000 * SECONDS
-        )
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -85,8 +85,8 @@ def resized(view: View, factor: float) -> View:
     """The view with ``factor`` times the pixels along each axis, at least one."""
     width, height = (max(1, round(size * factor)) for size in (view.width, view.height))
     x, y = width / view.width, height / view.height
-    intrinsics = {"fx": view.fx * x, "cx": view.cx * x, "fy": view.fy * y, "cy": view.cy * y}
-    return replace(view, width=width, height=height, **intrinsics)
+    fx, cx, fy, cy = view.fx * x, view.cx * x, view.fy * y, view.cy * y
+    return replace(view, width=width, height=height, fx=fx, cx=cx, fy=fy, cy=cy)
 
 
 def renders(gaussians: GaussianArrays, views: Sequence[View], options: RasterOptions) -> Images:

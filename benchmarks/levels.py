@@ -85,15 +85,8 @@ def resized(view: View, factor: float) -> View:
     """The view with ``factor`` times the pixels along each axis, at least one."""
     width, height = (max(1, round(size * factor)) for size in (view.width, view.height))
     x, y = width / view.width, height / view.height
-    return replace(
-        view,
-        width=width,
-        height=height,
-        fx=view.fx * x,
-        fy=view.fy * y,
-        cx=view.cx * x,
-        cy=view.cy * y,
-    )
+    fx, cx, fy, cy = view.fx * x, view.cx * x, view.fy * y, view.cy * y
+    return replace(view, width=width, height=height, fx=fx, cx=cx, fy=fy, cy=cy)
 
 
 def renders(gaussians: GaussianArrays, views: Sequence[View], options: RasterOptions) -> Images:

@@ -50,6 +50,9 @@ LOSSY_FORMATS: tuple[ExportFormat, ...] = ("spz", "spz4", "sog", "splat")
 MAX_MEASURED_LOSSES = 2_000_000
 # The formats that need a scene that GPS or ground control points place on the earth.
 PLACED_FORMATS: frozenset[ExportFormat] = frozenset(("tiles3d",))
+# The largest width and height of a mesh's texture by default: WebGL 2 has at least half of it on
+# any device, and most phones have it.
+MAX_TEXTURE_PX = 4096
 # The formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 

@@ -9,7 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, RENDERED_FORMATS
+from pipeline.config.export import (
+    LOSSY_FORMATS,
+    MAX_MEASURED_LOSSES,
+    MAX_TEXTURE_PX,
+    RENDERED_FORMATS,
+)
 from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
@@ -34,6 +39,8 @@ _LEVELS, _CHUNK = 260.0, 1 << 17
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
+# Bytes per pixel of a mesh's texture, which has no more pixels than the photographs.
+_TEXEL = 80.0
 # MB per photograph of a sparse model that is read; read with views; written; copied.
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
 # Bytes per pixel of a view in multi-view stereo: matched in a thread; fused in a thread; of the
@@ -258,7 +265,10 @@ def _export(plan: Plan, threads: int) -> float:
         )
     if rendered or selected:
         drawn = _evaluate(plan, threads) + _PARTITIONED * _gaussians(plan) * selected
-        needed.append(drawn + _MESH * ("mesh" in rendered))
+        texels = min(
+            (export.texture_px or MAX_TEXTURE_PX) ** 2 / 1e6, _photos(plan) * _view_pixels(plan)
+        )
+        needed.append(drawn + (_MESH + _TEXEL * texels) * ("mesh" in rendered))
     return max(needed)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
+from pipeline.config.export import MAX_TEXTURE_PX
 from pipeline.photos.load import load_view
 from pipeline.runtime.progress import track
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
@@ -30,9 +31,6 @@ from pipeline.surface.tsdf import camera_space
 
 Array = NDArray[np.float64]
 
-#: The largest width and height of the texture unless it is given: WebGL 2 has at least half of it
-#: on any device, and most phones have it.
-MOST_PX = 4096
 #: Exponent of the pixels per area in the weight of a view.
 SHARPNESS = 2.0
 #: Cosines of the viewing angle below it are not used.
@@ -105,7 +103,7 @@ def texture_mesh(
 
     Args:
         voxel: The accuracy of the mesh, world units.
-        texture_px: The largest width and height of the texture; None: ``MOST_PX``.
+        texture_px: The largest width and height of the texture; None: ``MAX_TEXTURE_PX``.
     """
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     sight = _Sight(vertices, faces, voxel)
@@ -113,7 +111,7 @@ def texture_mesh(
     usual = float(np.median(density[density > 0])) if density.any() else 1 / voxel
     # Unseen triangles, which have the colour of those beside them, need few texels.
     density = np.maximum(density, UNSEEN * usual)
-    atlas = cut_and_pack(vertices, faces, density, texture_px or MOST_PX)
+    atlas = cut_and_pack(vertices, faces, density, texture_px or MAX_TEXTURE_PX)
     baker = _Baker(sight, atlas)
     first = baker.mean(track(photographs, "texture", len(photographs.views), unit="views"), threads)
     again = track(photographs, "texture, second mean", len(photographs.views), unit="views")

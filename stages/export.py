@@ -4,8 +4,8 @@ Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``sog_
 ``.glb``, ``.usdc``); sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``,
 COLMAP; ``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
 ``dense_points.ply``, ``dense_maps/``, ``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and
-``.glb``, ``video`` and ``path.json``; ``tiles3d/`` of scenes that have a place on the
-earth.
+``.glb``, ``video`` and ``path.json``; ``tiles3d/``, ``orthophoto.tif``, ``dsm.tif``,
+``dense_points.laz`` and ``accuracy.html`` of scenes that have a place on the earth.
 """
 
 from __future__ import annotations
@@ -14,7 +14,13 @@ import hashlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.export import BLOCKS_FORMAT, DENSE_FORMATS, MASKS_FORMAT, Export
+from pipeline.config.export import (
+    BLOCKS_FORMAT,
+    DENSE_FORMATS,
+    MASKS_FORMAT,
+    SURVEY_FORMATS,
+    Export,
+)
 from pipeline.config.schema import Split, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
@@ -32,6 +38,7 @@ if TYPE_CHECKING:
     from pipeline.export.write import FoundMasks
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.scene.exposure import ExposureGains
 
 # Exported cameras are those of the full-size images, whatever the size of training views.
 FULL_SIZE = Views(max_long_side_px=MAX_SIDE_PX)
@@ -77,6 +84,7 @@ def work(job: Job) -> None:
         dense=job.inputs.get("dense"),
         partition=Partition.read(folder) if (folder := job.inputs.get("partition")) else None,
         found=_found_masks(job),
+        gains=_gains(job),
     )
     report = export_scene(
         job.out,
@@ -93,6 +101,17 @@ def work(job: Job) -> None:
             "their appearance embeddings and of their typical exposure"
         )
     job.record(report.counters, report.decisions, report.warnings)
+
+
+def _gains(job: Job) -> ExposureGains:
+    """The light of the views, which maps alone need."""
+    from pipeline.scene.exposure import NO_GAINS, ExposureGains
+
+    if SURVEY_FORMATS.isdisjoint(job.section(Export).formats):
+        return NO_GAINS
+    return ExposureGains.read_for(
+        job.inputs["train"], [view.name for view in inputs.trained_views(job)]
+    )
 
 
 def _found_masks(job: Job) -> FoundMasks | None:
@@ -156,5 +175,8 @@ SPEC = StageSpec(
         "scipy",
         "scikit-image",
         "opencv-contrib-python-headless",
+        "pyproj",
+        "laspy",
+        "lazrs",
     ),
 )

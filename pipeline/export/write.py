@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
-from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, PLACED_FORMATS, Export
+from pipeline.config.export import (
+    LOSSY_FORMATS,
+    MAX_MEASURED_LOSSES,
+    PLACED_FORMATS,
+    RENDERED_FORMATS,
+    SURVEY_FORMATS,
+    Export,
+)
 from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.export.selection import Selection, select_gaussians
@@ -33,6 +40,7 @@ from pipeline.mvs.maps import read_dense_cloud, read_map
 from pipeline.photos.found_masks import PosedPhotos, write_photo_masks
 from pipeline.photos.naming import rename
 from pipeline.scene.blocks import Partition
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
@@ -79,6 +87,7 @@ class ExportScene:
         partition: The blocks of the scene; None if the scene is one block.
         found: The masks that training found; None if they are not exported.
         num_invented: The number of invented Gaussians.
+        gains: The light of each view.
     """
 
     gaussians: GaussianArrays
@@ -93,6 +102,7 @@ class ExportScene:
     partition: Partition | None = None
     found: FoundMasks | None = None
     num_invented: int = 0
+    gains: ExposureGains = NO_GAINS
 
     @property
     def normalization(self) -> Normalization:
@@ -276,8 +286,12 @@ def export_scene(
         report.decisions.append(
             f"what compressed files lose is not measured above {MAX_MEASURED_LOSSES:,} Gaussians"
         )
-    absent = {name for name in config.formats if name in PLACED_FORMATS} - {
-        name for name, (file, _) in WRITERS.items() if file in written
+    maps = SURVEY_FORMATS.intersection(config.formats)
+    if scene.georeference is None or not scene.georeference.is_metric:
+        maps = frozenset()
+    absent = PLACED_FORMATS.intersection(config.formats) - {
+        *(name for name, (file, _) in WRITERS.items() if file in written),
+        *maps,
     }
     if absent:
         report.warnings.append(
@@ -287,7 +301,9 @@ def export_scene(
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")
     _write_frame(out, files, written, train, split)
-    if not set(config.formats) <= WRITERS.keys():
+    if maps:
+        _write_survey(out, files, config, threads, report)
+    if not RENDERED_FORMATS.isdisjoint(config.formats):
         _write_rendered_formats(out, scene, config, train, split, threads, report)
     return report
 
@@ -362,6 +378,28 @@ def _losses(
     protocol = choose_protocol(files.scene.training_size_views, split, train)
     options = protocol.options(train, threads)
     return measure_losses(lossy, files.gaussians, protocol.views, options)
+
+
+def _write_survey(
+    out: Path, files: _Files, config: Export, threads: int, report: ExportReport
+) -> None:
+    """Write the maps of a georeferenced scene."""
+    # The module is imported here because it imports pyproj and is rarely used.
+    from pipeline.survey.outputs import SurveyScene, write_survey
+
+    scene = files.scene
+    assert scene.georeference is not None
+    survey = SurveyScene(
+        scene.views,
+        scene.training_size_views,
+        scene.model,
+        scene.georeference,
+        scene.gains,
+        files.dense_folder,
+    )
+    messages = write_survey(out, survey, config, threads)
+    report.decisions += messages.decisions
+    report.warnings += messages.warnings
 
 
 def _write_rendered_formats(

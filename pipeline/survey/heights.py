@@ -1,9 +1,10 @@
 """A surface model (DSM): for each cell of a grid, the height of the highest surface that enough
 points confirm.
 
-Points above each other are separate surfaces if a gap is between their heights. Support is counted
-in blocks of 3 x 3 cells, so that single wrong points above or below a surface are left out; the
-height of a cell is the median of its highest supported surface. Small holes are interpolated.
+Points above each other are separate surfaces if a gap is between their heights. The surface is
+chosen in blocks of 3 x 3 cells, so that wrong points above or below it are left out; the height of
+a cell is the median of its points on the surface. Small holes are interpolated, and a median over
+3 x 3 cells removes noise without moving edges.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ Heights = NDArray[np.float32]
 
 # Surfaces above each other are separate from this distance, in cells.
 GAP_CELLS = 4.0
-# A surface needs so many points in a block of cells, and this share of all its points.
-BLOCK, MIN_POINTS, MIN_SHARE = 3, 3, 0.1
+# A surface needs so many points in a block of cells, and this share of the points of the block's
+# largest surface: a layer that only a few photographs have is not the surface.
+BLOCK, MIN_POINTS, MIN_SHARE = 3, 3, 0.75
 # The grid is made coarser until covered blocks have so many points per cell.
 POINTS_PER_CELL = 0.8
 # A hole is filled from known cells up to this far away, if there are some in this many of the eight
@@ -50,9 +52,11 @@ class CellHeights:
         """(R, W) heights with filled holes, ``TILE`` rows at a time; ``NODATA`` where unknown."""
         for top in range(0, self.grid.height, TILE):
             bottom = min(top + TILE, self.grid.height)
-            first, last = max(top - FILL_CELLS, 0), min(bottom + FILL_CELLS, self.grid.height)
-            known = self._rows(first, last)
-            yield filled(known)[top - first : top - first + bottom - top]
+            # The neighbours of a cell, and what they are interpolated from.
+            margin = FILL_CELLS + 1
+            first, last = max(top - margin, 0), min(bottom + margin, self.grid.height)
+            known = smoothed(filled(self._rows(first, last)))
+            yield known[top - first : bottom - first]
 
     def _rows(self, first: int, last: int) -> Heights:
         width = self.grid.width
@@ -69,36 +73,48 @@ def factor_for(points: Array, grid: Grid) -> int:
     while factor < 1024:
         cells = _cell_numbers(points, grid.coarser(factor), BLOCK)
         blocks, counts = np.unique(cells, return_counts=True)
-        # Of half of the points, so that thinly covered borders do not count.
+        # The median, so that thinly covered borders do not count.
         if np.median(counts) >= POINTS_PER_CELL * BLOCK**2 or len(blocks) == 1:
             break
         factor *= 2
     return factor
 
 
-def supported(points: Array, grid: Grid, gap: float) -> NDArray[np.bool_]:
-    """(N,) whether each of (N, 3) map points is on a surface that enough points confirm."""
-    order, start, size = _surfaces(_cell_numbers(points, grid, BLOCK), points[:, 2], gap)
-    block = _cell_numbers(points, grid, BLOCK)[order[start]]
-    _, member, total = np.unique(block, return_inverse=True, return_counts=True)
-    points_of_block = np.bincount(member, weights=size, minlength=len(total))[member]
-    good = (size >= MIN_POINTS) & (size >= MIN_SHARE * points_of_block)
+def on_surface(points: Array, grid: Grid, gap: float) -> NDArray[np.bool_]:
+    """(N,) whether each of (N, 3) map points is on the surface of its block of cells.
+
+    Args:
+        gap: The distance between surfaces in the unit of heights.
+    """
+    key = _cell_numbers(points, grid, BLOCK)
+    order = np.lexsort((-points[:, 2], key))
+    ordered_key, z = key[order], points[order, 2]
+    new = np.ones(len(order), bool)
+    new[1:] = (ordered_key[1:] != ordered_key[:-1]) | (z[:-1] - z[1:] > gap)
+    start = np.flatnonzero(new)
+    size = np.diff(np.append(start, len(order)))
+    first = np.flatnonzero(np.append(True, np.diff(ordered_key[start]) != 0))
+    largest = np.maximum.reduceat(size, first)
+    of_block = np.cumsum(np.isin(np.arange(len(start)), first)) - 1
+    good = np.flatnonzero((size >= MIN_POINTS) & (size >= MIN_SHARE * largest[of_block]))
+    # Surfaces of a block are ordered from high to low.
+    _, highest = np.unique(of_block[good], return_index=True)
+    chosen = np.zeros(len(start), bool)
+    chosen[good[highest]] = True
     found = np.empty(len(points), bool)
-    found[order] = np.repeat(good, size)
+    found[order] = np.repeat(chosen, size)
     return found
 
 
-def cell_heights(points: Array, grid: Grid, gap: float) -> CellHeights:
-    """The median height of the highest surface in each cell with points.
+def cell_heights(points: Array, grid: Grid) -> CellHeights:
+    """The median height of the points in each cell that has some.
 
     Args:
-        points: (N, 3) map points, which ``supported`` has chosen.
-        gap: The distance between surfaces in the unit of heights.
+        points: (N, 3) map points, which ``on_surface`` has chosen.
     """
-    numbers = _cell_numbers(points, grid, 1)
-    order, start, size = _surfaces(numbers, points[:, 2], gap)
-    cells, highest = np.unique(numbers[order[start]], return_index=True)
-    first, count = start[highest], size[highest]
+    key = _cell_numbers(points, grid, 1)
+    order = np.lexsort((points[:, 2], key))
+    cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
     z = points[order, 2]
     median = (z[first + (count - 1) // 2] + z[first + count // 2]) / 2
     return CellHeights(grid, cells, median.astype(np.float32))
@@ -127,6 +143,20 @@ def filled(heights: Heights) -> Heights:
     return np.where(enough, mean, heights).astype(np.float32)
 
 
+def smoothed(heights: Heights) -> Heights:
+    """Each known height replaced by the median of the known ones in 3 x 3 cells."""
+    rows, width = heights.shape
+    # Unknown heights are infinite, so that they are last in the order.
+    around = np.pad(np.where(heights == NODATA, np.inf, heights), 1, constant_values=np.inf)
+    nine = [around[y : y + rows, x : x + width] for y in range(3) for x in range(3)]
+    ordered = np.sort(np.stack(nine), axis=0)
+    count = np.maximum(np.isfinite(ordered).sum(0), 1)[None]
+    lower, upper = (
+        np.take_along_axis(ordered, index, 0)[0] for index in ((count - 1) // 2, count // 2)
+    )
+    return np.where(heights == NODATA, heights, (lower + upper) / 2).astype(np.float32)
+
+
 def _cell_numbers(points: Array, grid: Grid, block: int) -> NDArray[np.int64]:
     """(N,) the number of the cell, or block of cells, of each point."""
     row, column = (np.floor(values / block).astype(np.int64) for values in grid.cells_of(points))
@@ -134,16 +164,3 @@ def _cell_numbers(points: Array, grid: Grid, block: int) -> NDArray[np.int64]:
     return np.asarray(
         np.clip(row, 0, -(-grid.height // block) - 1) * width + np.clip(column, 0, width - 1)
     )
-
-
-def _surfaces(
-    key: NDArray[np.int64], heights: Array, gap: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """The points ordered by key, those of a key from high to low, and for each run without a gap
-    its start in this order and its number of points."""
-    order = np.lexsort((-heights, key))
-    ordered_key, z = key[order], heights[order]
-    new = np.ones(len(order), bool)
-    new[1:] = (ordered_key[1:] != ordered_key[:-1]) | (z[:-1] - z[1:] > gap)
-    start = np.flatnonzero(new)
-    return order, start, np.diff(np.append(start, len(order)))

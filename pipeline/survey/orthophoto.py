@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.geotiff import NODATA, TILE
-from pipeline.mvs.maps import read_map
+from pipeline.mvs.maps import read_depth_of_map
 from pipeline.photos.load import load_view
 from pipeline.photos.threads import one_thread_of_opencv
 from pipeline.runtime.progress import track
@@ -30,8 +30,8 @@ from pipeline.survey.map_frame import MapFrame
 
 Array = NDArray[np.float64]
 
-# Photographs in memory at a time.
-CACHED_PHOTOS = 12
+# Photographs, and depth maps at the size of training, in memory at a time.
+CACHED_PHOTOS, CACHED_DEPTHS = 12, 48
 # Photographs that a tile of the map is made of at most: the most vertical ones.
 MAX_PHOTOS_PER_TILE = 32
 # Photographs are blended where the tangents of their angles to the vertical differ by about this.
@@ -45,23 +45,20 @@ NEARER_CELLS, NEARER_SHARE = 4.0, 0.005
 # Every so many cells of a tile are projected to choose photographs.
 _SAMPLED = 61
 _TOO_FAR = 1e9
+_SMALL_WEIGHT = 0.01
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph of the map.
+    """The pixels of a photograph.
 
     Attributes:
-        view: Its camera, at the size of ``rgb``.
         rgb: (H, W, 3) uint8, in the scene's typical light.
-        valid: (H, W) bool, False for what masks and alpha exclude; None if everything is valid.
-        depth: (h, w) float32 camera z over the same view, 0 where unknown.
+        valid: (H, W) uint8, 0 for what masks and alpha exclude; None if everything is valid.
     """
 
-    view: View
     rgb: NDArray[np.uint8]
-    valid: NDArray[np.bool_] | None
-    depth: NDArray[np.float32]
+    valid: NDArray[np.uint8] | None
 
 
 @dataclass(frozen=True)
@@ -70,11 +67,14 @@ class Photos:
 
     Attributes:
         views: The cameras at the size to read.
-        read: Returns a photograph by its index.
+        photo: Returns the pixels of a view by its index.
+        depth: Returns the depth map of a view by its index: (h, w) float32 camera z over the whole
+            view, 0 where unknown.
     """
 
     views: Sequence[View]
-    read: Callable[[int], Photo]
+    photo: Callable[[int], Photo]
+    depth: Callable[[int], NDArray[np.float32]]
 
 
 def photos_of(
@@ -96,7 +96,7 @@ def photos_of(
     ]
 
     @lru_cache(CACHED_PHOTOS)
-    def read(index: int) -> Photo:
+    def photo(index: int) -> Photo:
         view = chosen[index]
         pixels = load_view(view)
         rgb, light = pixels.rgb, gains.of(view.name)
@@ -107,9 +107,13 @@ def photos_of(
         if pixels.alpha is not None:
             opaque = pixels.alpha == 255
             valid = opaque if valid is None else valid & opaque
-        return Photo(view, rgb, valid, read_map(dense, view.name).depth)
+        return Photo(rgb, None if valid is None else valid.astype(np.uint8))
 
-    return Photos(chosen, read)
+    @lru_cache(CACHED_DEPTHS)
+    def depth(index: int) -> NDArray[np.float32]:
+        return read_depth_of_map(dense, chosen[index].name)
+
+    return Photos(chosen, photo, depth)
 
 
 @dataclass
@@ -118,11 +122,12 @@ class Overlap:
 
     Attributes:
         cells: The number of cells with colours.
-        photos: The sum over them of the number of photographs.
+        photos: The sum over them of the number of photographs whose frame has the cell, whatever
+            may be in front of it.
     """
 
     cells: int = 0
-    photos: int = 0
+    photos: float = 0.0
 
     @property
     def mean(self) -> float:
@@ -151,15 +156,17 @@ def orthophoto_strips(
         for top in track(tops, "orthophoto", len(tops), unit="strips"):
             rows = min(TILE, grid.height - top)
 
-            def tile(left: int, top: int = top, rows: int = rows) -> tuple[NDArray, int]:
+            def tile(left: int, top: int = top, rows: int = rows) -> tuple[NDArray, float]:
                 size = rows, min(TILE, grid.width - left)
                 points = _points(grid, surface, surface_grid, top, left, size)
                 return _coloured(photos, frame, points, size, grid.cell * frame.unit)
 
             tiles = list(pool.map(tile, range(0, grid.width, TILE)))
             strip = np.concatenate([colours for colours, _ in tiles], axis=1)
-            overlap.cells += int((strip[..., 3] > 0).sum())
-            overlap.photos += sum(count for _, count in tiles)
+            for colours, photos_per_cell in tiles:
+                cells = int((colours[..., 3] > 0).sum())
+                overlap.cells += cells
+                overlap.photos += photos_per_cell * cells
             yield strip
 
 
@@ -200,78 +207,87 @@ def height_at(places: Array, surface: NDArray[np.float32], grid: Grid) -> Array:
 
 def _coloured(
     photos: Photos, frame: MapFrame, points: Array, size: tuple[int, int], cell_m: float
-) -> tuple[NDArray[np.uint8], int]:
-    """(R, C, 4) RGBA of a tile, and the sum over its cells of the photographs that show them."""
+) -> tuple[NDArray[np.uint8], float]:
+    """(R, C, 4) RGBA of a tile, and the mean number of photographs whose frame has a cell."""
     result = np.zeros((len(points), 4), np.uint8)
     known = np.flatnonzero(np.isfinite(points[:, 2]))
     if not len(known):
-        return result.reshape(*size, 4), 0
+        return result.reshape(*size, 4), 0.0
     xyz = frame.to_scene(points[known])
-    chosen = _most_vertical(photos.views, xyz[:: min(_SAMPLED, len(xyz))])
-    costs = np.full((len(chosen), len(xyz)), np.float32(_TOO_FAR))
-    for place, index in enumerate(chosen):
-        costs[place] = _cost(photos.read(index), xyz, cell_m)
-    if not len(chosen):
-        return result.reshape(*size, 4), 0
+    chosen, overlap = _most_vertical(photos.views, xyz[:: min(_SAMPLED, len(xyz))])
+    if not chosen:
+        return result.reshape(*size, 4), 0.0
+    costs = np.stack([_cost(photos, index, xyz, cell_m) for index in chosen])
     best = costs.min(0)
-    shown = best < _TOO_FAR
     weights = np.where(costs < _TOO_FAR, np.exp((best - costs) / BLENDING), 0)
-    weights[weights < 0.01] = 0
-    total = np.zeros((len(xyz), 3))
+    weights[weights < _SMALL_WEIGHT] = 0
+    light, total = np.zeros((len(xyz), 3)), np.zeros(len(xyz))
     for place, index in enumerate(chosen):
         where = np.flatnonzero(weights[place])
         if len(where):
-            photo = photos.read(index)
-            total[where] += weights[place, where, None] * _colours(photo, xyz[where])
-    mean = total / np.maximum(weights.sum(0), 1e-9)[:, None]
-    result[known, :3] = np.where(shown[:, None], np.rint(mean), 0)
-    result[known, 3] = np.where(shown, 255, 0)
-    return result.reshape(*size, 4), int((costs < _TOO_FAR).sum())
+            colours, valid = _colours(photos, index, xyz[where])
+            weight = weights[place, where] * valid
+            light[where] += weight[:, None] * colours
+            total[where] += weight
+    shown = total > 0
+    result[known[shown], :3] = np.rint(light[shown] / total[shown, None])
+    result[known[shown], 3] = 255
+    return result.reshape(*size, 4), overlap
 
 
-def _most_vertical(views: Sequence[View], xyz: Array) -> list[int]:
-    """The views that show some of the points, those that look most vertically first."""
-    found = []
+def _most_vertical(views: Sequence[View], xyz: Array) -> tuple[list[int], float]:
+    """The views whose frames have some of the points, those that look most vertically first, and
+    the mean number of views whose frame has a point."""
+    found, number = [], 0
     for index, view in enumerate(views):
         x, y, z = _projected(view, xyz)
         inside = (z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
         if inside.any():
+            number += int(inside.sum())
             found.append((float(np.median(_tangent(view, xyz[inside]))), index))
-    return [index for _, index in sorted(found)[:MAX_PHOTOS_PER_TILE]]
+    return [index for _, index in sorted(found)[:MAX_PHOTOS_PER_TILE]], number / len(xyz)
 
 
-def _cost(photo: Photo, xyz: Array, cell_m: float) -> NDArray[np.float32]:
-    """(N,) what it costs to show each point by this photograph: the tangent of the angle to the
+def _cost(photos: Photos, index: int, xyz: Array, cell_m: float) -> NDArray[np.float32]:
+    """(N,) what it costs to show each point by a photograph: the tangent of the angle to the
     vertical, and more at the photograph's edge and where its depth is unknown; ``_TOO_FAR`` where
     it does not show the point."""
-    view = photo.view
+    view, map_ = photos.views[index], photos.depth(index)
+    cost = np.full(len(xyz), np.float32(_TOO_FAR))
     x, y, z = _projected(view, xyz)
-    shows = (z > 0) & (x >= 0.5) & (x < view.width - 0.5) & (y >= 0.5) & (y < view.height - 0.5)
-    u, v = np.where(shows, x, 0), np.where(shows, y, 0)
-    if photo.valid is not None:
-        shows &= photo.valid[v.astype(int), u.astype(int)]
-    rows, columns = photo.depth.shape
-    depth = photo.depth[
-        (v * (rows / view.height)).astype(int), (u * (columns / view.width)).astype(int)
-    ]
-    shows &= (depth == 0) | (z - depth < NEARER_CELLS * cell_m + NEARER_SHARE * z)
-    to_edge = np.minimum.reduce([u, view.width - u, v, view.height - v]) / (BORDER * view.width)
-    cost = _tangent(view, xyz) + EDGE * (1 - to_edge.clip(0, 1)) + UNKNOWN_DEPTH * (depth == 0)
-    return np.where(shows, cost, _TOO_FAR).astype(np.float32)
+    inside = (z > 0) & (x >= 0.5) & (x < view.width - 0.5) & (y >= 0.5) & (y < view.height - 0.5)
+    where = np.flatnonzero(inside)
+    x, y, z = x[where], y[where], z[where]
+    rows, columns = map_.shape
+    depth = map_[(y * (rows / view.height)).astype(int), (x * (columns / view.width)).astype(int)]
+    hidden = (depth > 0) & (z - depth > NEARER_CELLS * cell_m + NEARER_SHARE * z)
+    to_edge = np.minimum.reduce([x, view.width - x, y, view.height - y]) / (BORDER * view.width)
+    found = _tangent(view, xyz[where]) + EDGE * (1 - to_edge.clip(0, 1))
+    cost[where] = np.where(hidden, _TOO_FAR, found + UNKNOWN_DEPTH * (depth == 0))
+    return cost
 
 
-def _colours(photo: Photo, xyz: Array) -> NDArray[np.float32]:
-    """(N, 3) the photograph's colours at points that it shows, bilinear."""
-    x, y, _ = _projected(photo.view, xyz)
+def _colours(
+    photos: Photos, index: int, xyz: Array
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(N, 3) the photograph's colours at points in its frame, bilinear, and (N,) whether these
+    pixels are valid."""
+    photo = photos.photo(index)
+    x, y, _ = _projected(photos.views[index], xyz)
     # OpenCV's pixel centres are integers, and it takes no more than 32767 rows.
     side = math.ceil(math.sqrt(len(x)))
     places = np.zeros((2, side * side), np.float32)
     places[0, : len(x)], places[1, : len(x)] = x - 0.5, y - 0.5
-    maps = places.reshape(2, side, side)
-    found = cv2.remap(
-        photo.rgb, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return np.asarray(found.reshape(-1, 3)[: len(x)], np.float32)
+    columns, rows = places.reshape(2, side, side)
+
+    def sampled(picture: NDArray[np.uint8], method: int) -> NDArray:
+        return cv2.remap(picture, columns, rows, method, borderMode=cv2.BORDER_REPLICATE)
+
+    colours = sampled(photo.rgb, cv2.INTER_LINEAR).reshape(-1, 3)[: len(x)]
+    if photo.valid is None:
+        return colours.astype(np.float32), np.ones(len(x), bool)
+    valid = sampled(photo.valid, cv2.INTER_NEAREST).ravel()[: len(x)]
+    return colours.astype(np.float32), valid > 0
 
 
 def _projected(view: View, xyz: Array) -> tuple[Array, Array, Array]:

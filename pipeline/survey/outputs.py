@@ -34,7 +34,7 @@ from pipeline.survey.heights import (
     CellHeights,
     cell_heights,
     factor_for,
-    supported,
+    on_surface,
 )
 from pipeline.survey.map_frame import MapFrame, map_frame
 from pipeline.survey.orthophoto import Overlap, orthophoto_strips, photos_of
@@ -166,14 +166,14 @@ def _surface(
         )
     coarse = grid.coarser(factor_for(points, grid))
     gap = GAP_CELLS * coarse.cell * frame.unit / frame.height_unit
-    points = points[supported(points, coarse, gap)]
+    points = points[on_surface(points, coarse, gap)]
     if not len(points):
         raise empty
     # The grid again: points far from all others are gone.
     factor = round(coarse.cell / grid.cell)
     coarse = grid_over(points, coarse.cell)
     grid = Grid(coarse.west, coarse.north, grid.cell, coarse.width * factor, coarse.height * factor)
-    return grid, cell_heights(points, coarse, gap)
+    return grid, cell_heights(points, coarse)
 
 
 def _stored(heights: CellHeights, surface: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:

@@ -4,8 +4,8 @@ Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.sog``, ``sog_
 ``.glb``, ``.usdc``); sparse points (``points.ply``); cameras (``sparse/0`` and ``sparse_text``,
 COLMAP; ``transforms.json``); ``frame.json`` with axes, unit and up direction. On demand
 ``dense_points.ply``, ``dense_maps/``, ``masks/``, ``renders/``, ``depths/``, ``mesh.ply`` and
-``.glb``, ``video`` and ``path.json``; ``tiles3d/`` of scenes that have a place on the
-earth.
+``.glb``, ``video`` and ``path.json``; ``tiles3d/``, ``orthophoto.tif``, ``dsm.tif``,
+``dense_points.laz`` and ``accuracy.html`` of scenes that have a place on the earth.
 """
 
 from __future__ import annotations
@@ -160,5 +160,8 @@ SPEC = StageSpec(
         "fast-simplification",
         "xatlas",
         "opencv-contrib-python-headless",
+        "pyproj",
+        "laspy",
+        "lazrs",
     ),
 )

@@ -40,6 +40,7 @@ ROOMS = {
     "coverage": "what the photographs did not see",
     "holes": "invented content for places that no photograph shows",
     "surface": "meshes",
+    "survey": "maps of georeferenced scenes: surface model, orthophoto, report on accuracy",
     "export": "files for other programs",
     "reporting": "metrics.json, the page of a scene, tables of batches",
     "watching": "the live view of a training",

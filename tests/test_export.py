@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from pipeline.config.export import RENDERED_FORMATS, ExportFormat
+from pipeline.config.export import RENDERED_FORMATS, SURVEY_FORMATS, ExportFormat
 from pipeline.config.settled import Config
 from pipeline.config.video import VideoExport
 from pipeline.export.counters import ExportCounters
@@ -117,7 +117,7 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
 
 
 def test_every_format_the_schema_offers_is_written(scene):
-    assert set(WRITERS) | RENDERED_FORMATS == set(FORMATS)
+    assert set(WRITERS) | RENDERED_FORMATS | SURVEY_FORMATS == set(FORMATS)
     out, job = export(
         scene, formats=list(WRITERS), sh_degree=1, min_opacity=0.3, morton_order=False
     )

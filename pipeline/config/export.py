@@ -31,6 +31,8 @@ ExportFormat = Literal[
     "transforms",
     "dense_points",
     "dense_maps",
+    "ortho",
+    "laz",
     "masks",
     "renders",
     "depths",
@@ -39,7 +41,11 @@ ExportFormat = Literal[
 ]
 ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
 # The formats that need multi-view stereo; the mesh of a region is of its Gaussians alone.
-DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps", "mesh"))
+DENSE_FORMATS: frozenset[ExportFormat] = frozenset(
+    ("dense_points", "dense_maps", "ortho", "laz", "mesh")
+)
+# The formats that are maps, which have a page on their accuracy beside them.
+SURVEY_FORMATS: frozenset[ExportFormat] = frozenset(("ortho", "laz"))
 # The format that needs the blocks of the scene.
 BLOCKS_FORMAT: ExportFormat = "blocks"
 # The format that needs the photographs before undistortion.
@@ -49,7 +55,7 @@ LOSSY_FORMATS: tuple[ExportFormat, ...] = ("spz", "spz4", "sog", "splat")
 # The loss of larger scenes is not measured: its renders hold all Gaussians several times.
 MAX_MEASURED_LOSSES = 2_000_000
 # The formats that need a scene that GPS or ground control points place on the earth.
-PLACED_FORMATS: frozenset[ExportFormat] = frozenset(("tiles3d",))
+PLACED_FORMATS: frozenset[ExportFormat] = frozenset(("tiles3d", "ortho", "laz"))
 # The largest width and height of a mesh's texture by default: WebGL 2 has at least half of it on
 # any device, and most phones have it.
 MAX_TEXTURE_PX = 4096
@@ -73,7 +79,9 @@ class Export(Section):
         "points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
-        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). masks: what "
+        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Of scenes with "
+        "GPS or ground control points: ortho (orthophoto and surface model, GeoTIFF), laz (fused "
+        "point cloud, LAZ), both with accuracy.html. masks: what "
         "train.transients left out, as masks of the photographs (PNG). Rendered from every view: "
         "renders (PNG), depths (float TIFF), video (along a camera path). From both: mesh (GLB "
         "with a texture from the photographs, and PLY with colours).",
@@ -89,6 +97,11 @@ class Export(Section):
         description="Export only what lies in a box, [x0, y0, z0, x1, y1, z1] in the frame and "
         "unit of the exported Gaussians, without the skybox. subject: a box around what most "
         "cameras have in their images. null: everything.",
+    )
+    ground_sampling_m: Annotated[float, Field(ge=1e-3, le=100.0), Unit("m")] | None = Field(
+        None,
+        description="Size of a cell of the orthophoto. null: the median size of a pixel of the "
+        "training views on the ground, two significant digits.",
     )
     mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(
         None,

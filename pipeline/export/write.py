@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
-from pipeline.config.export import LOSSY_FORMATS, MAX_MEASURED_LOSSES, PLACED_FORMATS, Export
+from pipeline.config.export import (
+    LOSSY_FORMATS,
+    MAX_MEASURED_LOSSES,
+    PLACED_FORMATS,
+    RENDERED_FORMATS,
+    SURVEY_FORMATS,
+    Export,
+)
 from pipeline.config.schema import Split, Train
 from pipeline.export.counters import ExportCounters, FileLoss
 from pipeline.export.selection import Selection, select_gaussians
@@ -288,8 +295,12 @@ def export_scene(
         report.decisions.append(
             f"what compressed files lose is not measured above {MAX_MEASURED_LOSSES:,} Gaussians"
         )
-    absent = {name for name in config.formats if name in PLACED_FORMATS} - {
-        name for name, (file, _) in WRITERS.items() if file in written
+    maps = SURVEY_FORMATS.intersection(config.formats)
+    if scene.georeference is None or not scene.georeference.is_metric:
+        maps = frozenset()
+    absent = PLACED_FORMATS.intersection(config.formats) - {
+        *(name for name, (file, _) in WRITERS.items() if file in written),
+        *maps,
     }
     if absent:
         report.warnings.append(
@@ -299,7 +310,9 @@ def export_scene(
     if "masks" in config.formats and WRITERS["masks"][0] not in written:
         report.decisions.append("no masks: training left nothing out (train.transients)")
     _write_frame(out, files, written, train, split)
-    if not set(config.formats) <= WRITERS.keys():
+    if maps:
+        _write_survey(out, files, config, threads, report)
+    if not RENDERED_FORMATS.isdisjoint(config.formats):
         options = choose_protocol(scene.training_size_views, split, train).options(train, threads)
         _write_rendered_formats(out, scene, config, options, normalization.scale, report)
     return report
@@ -375,6 +388,28 @@ def _losses(
     protocol = choose_protocol(files.scene.training_size_views, split, train)
     options = protocol.options(train, threads)
     return measure_losses(lossy, files.gaussians, protocol.views, options)
+
+
+def _write_survey(
+    out: Path, files: _Files, config: Export, threads: int, report: ExportReport
+) -> None:
+    """Write the maps of a georeferenced scene."""
+    # The module is imported here because it imports pyproj and is rarely used.
+    from pipeline.survey.outputs import SurveyScene, write_survey
+
+    scene = files.scene
+    assert scene.georeference is not None
+    survey = SurveyScene(
+        scene.views,
+        scene.training_size_views,
+        scene.model,
+        scene.georeference,
+        scene.gains,
+        files.dense_folder,
+    )
+    messages = write_survey(out, survey, config, threads)
+    report.decisions += messages.decisions
+    report.warnings += messages.warnings
 
 
 def _write_rendered_formats(

@@ -86,15 +86,27 @@ def read_map(folder: Path, name: str) -> DenseMap:
         UserError: the file is missing or damaged.
     """
     arrays = _read(_map_file(folder, name), ("log_depth", "span", "normals", "confidence"))
+    depth = _depth_of(arrays)
+    normals = _from_octahedral(arrays["normals"])
+    normals[depth == 0] = 0
+    confidence = arrays["confidence"].astype(np.float32) / 255
+    return DenseMap(depth, normals, np.asarray(confidence, np.float32))
+
+
+def read_depth_of_map(folder: Path, name: str) -> NDArray[np.float32]:
+    """``read_map(...).depth``, without reading the rest.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    return _depth_of(_read(_map_file(folder, name), ("log_depth", "span")))
+
+
+def _depth_of(arrays: dict[str, NDArray]) -> NDArray[np.float32]:
     code, span = arrays["log_depth"], arrays["span"]
-    known = code > 0
     width = max(float(span[1] - span[0]), 1e-12)
     depth = np.exp(span[0] + (code.astype(np.float64) - 1) / _STEPS * width)
-    normals = _from_octahedral(arrays["normals"])
-    normals[~known] = 0
-    confidence = arrays["confidence"].astype(np.float32) / 255
-    depth = np.where(known, depth, 0)
-    return DenseMap(np.asarray(depth, np.float32), normals, np.asarray(confidence, np.float32))
+    return np.asarray(np.where(code > 0, depth, 0), np.float32)
 
 
 def write_dense_cloud(folder: Path, cloud: DenseCloud) -> None:

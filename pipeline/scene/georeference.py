@@ -59,6 +59,10 @@ class Residual(JsonObject):
         description="Model minus measurement along z, metres; null without a measured altitude."
     )
     used: bool = Field(description="Whether it is an inlier, which the fit uses.")
+    x_m: float | None = Field(
+        None, description="Model minus measurement along x, metres; null in older files."
+    )
+    y_m: float | None = Field(None, description="As `x_m`, along y.")
 
 
 class ResidualSummary(JsonObject):

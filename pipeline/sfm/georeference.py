@@ -19,7 +19,6 @@ from pipeline.geometry.geodesy import to_enu
 from pipeline.geometry.similarity import RobustFit, Similarity
 from pipeline.geometry.up_direction import Contradiction, ImageDirections
 from pipeline.io.projection import Projection
-from pipeline.runtime.text import shortened
 from pipeline.scene.georeference import (
     FrameUncertainty,
     GeographicOrigin,
@@ -104,7 +103,7 @@ class WorldFrame:
             if located
             else f"{LEVEL_SHARE:.0%} of the cameras lie within {LEVEL_RADIUS:g} of their mean",
             origin=self.origin,
-            projection=self.projection and shortened(self.projection.text, 1000),
+            projection=self.projection and self.projection.text,
             projection_units_m=self.projection
             and (None if self.projection.geographic else self.projection.horizontal_vertical),
             scale=self.similarity.scale,
@@ -245,6 +244,8 @@ def residual_records(
             horizontal_m=round(float(np.hypot(r[0], r[1])), 4),
             vertical_m=round(float(r[2]), 4) if np.isfinite(r[2]) else None,
             used=bool(inlier),
+            x_m=round(float(r[0]), 4),
+            y_m=round(float(r[1]), 4),
         )
         for name, r, inlier in zip(names, residual, used, strict=True)
     )

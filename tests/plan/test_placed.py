@@ -35,6 +35,15 @@ def test_without_positions_or_with_the_georeference_off_the_error_says_what_to_g
         make_plan(many(tmp_path / "s", 3, gps=gps), off)
 
 
+@pytest.mark.parametrize("name", ["ortho", "laz"])
+def test_maps_need_a_place_on_the_earth_and_stereo(tmp_path: Path, name: str) -> None:
+    config = Config.model_validate({"export": {"formats": [name]}})
+    with pytest.raises(UserError, match=f"{name} needs a scene with a place on the earth"):
+        make_plan(many(tmp_path / "s", 3), config)
+    plan = make_plan(many(tmp_path / "t", 3, gps=gps), config)
+    assert plan.stages["dense"].run
+
+
 def test_given_poses_have_a_world_of_their_own(tmp_path: Path) -> None:
     folder = tmp_path / "s"
     transforms(folder)

@@ -194,6 +194,7 @@ CONDITIONAL = {
     "sfm.min_registered_share": "a model that lacks photographs, which is an error",
     "sfm.component": "photographs that fall into several components",
     "sfm.georeference": "photographs with GPS, or gcp_list.txt",
+    "export.ground_sampling_m": "photographs with GPS (tests/survey/test_maps.py)",
     "train.device": "a GPU (tests/training/test_device.py)",
     "train.transients": "30 epochs, and someone who passes by (tests/training/transients)",
     "train.density.pixels_per_gaussian": "views of more than 40 000 pixels",

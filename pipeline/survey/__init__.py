@@ -1,0 +1,1 @@
+"""Maps of a georeferenced scene: elevations, an orthophoto, a report on their accuracy."""

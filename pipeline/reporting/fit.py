@@ -17,6 +17,10 @@ _SAMPLE = 20_000
 _MARGIN = 0.95
 
 
+MAX_GAUSSIANS = 200_000
+"""The largest number of Gaussians in a page: more take long to appear."""
+
+
 @dataclass(frozen=True)
 class Packed:
     """Gaussians as bytes of an SPZ file, with their number and SH degree.
@@ -31,11 +35,11 @@ class Packed:
 
 
 def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int) -> Packed:
-    """Compress Gaussians to at most about ``max_bytes``.
+    """Compress at most ``MAX_GAUSSIANS`` Gaussians to at most about ``max_bytes``.
 
-    Bands of spherical harmonics are dropped first, then the Gaussians of least prominence: at the
-    same size, renders without SH are closer to those of the complete scene than renders of fewer
-    Gaussians.
+    Of more, the most prominent are taken. Bands of spherical harmonics are dropped first, then the
+    Gaussians of least prominence: at the same size, renders without SH are closer to those of the
+    complete scene than renders of fewer Gaussians.
 
     Args:
         centres: (C, 3) camera centres, world.
@@ -43,16 +47,22 @@ def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int)
     """
     step = max(len(gaussians) // _SAMPLE, 1)
     sample, degree, number = np.arange(0, len(gaussians), step), gaussians.sh_degree, 0
+    wanted = min(len(gaussians), MAX_GAUSSIANS)
     for degree in range(gaussians.sh_degree, -1, -1):
         each = len(_encode(gaussians, sample, degree)) / len(sample)
-        number = max(int(max_bytes * _MARGIN / each), 0)
-        if number >= len(gaussians):
+        number = min(max(int(max_bytes * _MARGIN / each), 0), wanted)
+        if number == wanted:
             break
     rows = np.arange(len(gaussians))
     if number < len(rows):
         rank = np.argsort(-prominence(gaussians, centres), kind="stable")
         rows = np.sort(rank[:number])
     return Packed(_encode(gaussians, rows, degree), len(rows), degree)
+
+
+def encoded(gaussians: GaussianArrays) -> bytes:
+    """All Gaussians as an SPZ file in the coordinates of the page, as ``Packed``."""
+    return _encode(gaussians, np.arange(len(gaussians)), gaussians.sh_degree)
 
 
 def _encode(gaussians: GaussianArrays, rows: NDArray[np.intp], degree: int) -> bytes:

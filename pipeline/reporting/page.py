@@ -1,7 +1,8 @@
 """The report page of a scene: one HTML file that needs no network.
 
-Style, scripts and images are embedded. A content security policy forbids any other request. The
-same results give the same bytes.
+Style, scripts and images are embedded. A content security policy forbids any other request, but for
+that of a file with all Gaussians beside the page of a large scene. The same results give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ from pipeline.reporting.metrics import TimedMetrics
 from pipeline.reporting.names import with_photograph_names
 from pipeline.reporting.pictures import ERROR_SCALE, embedded, page_pictures, scale_gradient
 from pipeline.reporting.publish import MARK
-from pipeline.reporting.space import ViewerContent, viewer_content, viewer_poster, viewer_script
+from pipeline.reporting.space import (
+    ViewerContent,
+    viewer_content,
+    viewer_poster,
+    viewer_script,
+    write_all,
+)
 from pipeline.reporting.verdict import grouped_warnings, verdict
 from pipeline.runtime.atomic import write_text
 from pipeline.scene.georeference import GeoreferenceSummary
@@ -46,7 +53,8 @@ class Measure(NamedTuple):
 
 
 def write_report(results: SceneResults, path: Path) -> None:
-    """Write the page to ``path`` atomically."""
+    """Write the page to ``path`` and, beside it, the Gaussians that are too many for it."""
+    write_all(results, path.parent)
     write_text(path, report_html(results))
 
 

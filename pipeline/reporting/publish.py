@@ -1,4 +1,4 @@
-"""``splatmake publish``: a folder with the page of a scene and the files that it offers."""
+"""``splatmake publish``: a folder with the page of a scene and the files that it links to."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from pipeline.runtime.atomic import replace_folder
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import RECORDS
 
-PAGE, ENTRY, EXPORTS = "report.html", "index.html", "export"
+PAGE, ENTRY, EXPORTS, REPORT = "report.html", "index.html", "export", "report"
 
 # The line in the page's head by which a published folder is recognised.
 MARK = '<meta name="generator" content="splatmake">'
 
-_LINK = re.compile(rf'href="({EXPORTS}/[^"/]+)"')
+# Exported files, and the scene's Gaussians if they are too many for the page.
+_LINK = re.compile(rf'(?:href="({EXPORTS}/[^"/]+)"|data-file="({REPORT}/[^"/]+)")')
 _LABELS = {
     "point_cloud.ply": "Gaussians, for every program (PLY)",
     "point_cloud.spz": "Gaussians, compact (SPZ)",
@@ -69,7 +70,7 @@ def downloads(exports: Path) -> list[Download]:
 
 
 def publish(scene: Path, target: Path) -> list[str]:
-    """Write a folder to upload: the page as ``index.html``, and the exported files it links to.
+    """Write a folder to upload: the page as ``index.html``, and the files it links to.
 
     Args:
         scene: The folder of a finished scene, ``results/NAME``.
@@ -84,7 +85,7 @@ def publish(scene: Path, target: Path) -> list[str]:
     """
     page = scene / PAGE
     try:
-        links = _LINK.findall(page.read_text("utf-8"))
+        links = [one or other for one, other in _LINK.findall(page.read_text("utf-8"))]
     except FileNotFoundError:
         raise UserError(
             "expected the page of a finished scene, found none",
@@ -122,9 +123,9 @@ def _check_target(target: Path) -> None:
         inside = {entry.name for entry in target.iterdir()}
         entry = target / ENTRY
         ours = entry.is_file() and MARK in entry.read_text("utf-8", errors="replace")[:2000]
-        if not inside or (ours and inside <= {ENTRY, EXPORTS}):
+        if not inside or (ours and inside <= {ENTRY, EXPORTS, REPORT}):
             return
-        other = min(inside - {ENTRY, EXPORTS} or inside)
+        other = min(inside - {ENTRY, EXPORTS, REPORT} or inside)
         found = f"a folder with other files (first: {other})"
     elif target.exists() or target.is_symlink():
         found = "a file"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import math
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from pipeline.export.selection import subject_box
 from pipeline.reporting.data import SceneResults, TrainedScene
 from pipeline.reporting.depths import COLUMNS, DEPTH_RATIO, ROWS, coarse_depths, depth_codes
-from pipeline.reporting.fit import Packed, fit
+from pipeline.reporting.fit import MAX_GAUSSIANS, Packed, encoded, fit
 from pipeline.reporting.pictures import Embedded, embedded, shrunk, upright
 from pipeline.reporting.text import count
+from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
@@ -29,6 +30,9 @@ from pipeline.splats.arrays import GaussianArrays
 Array = NDArray[np.float64]
 
 _VIEWER = Path(__file__).with_name("viewer") / "viewer.min.js"
+
+#: The link from the page to a file with all Gaussians, which the stage ``report`` writes.
+FULL = "report/scene.spz"
 
 _MAX_POINTS = 25_000
 # The longer side of the poster in pixels, and its JPEG quality.
@@ -48,16 +52,18 @@ class ViewerContent(NamedTuple):
 
     Attributes:
         shown: A sentence on the Gaussians in the page.
-        data: The viewer's input as JSON (``viewer_data``).
+        data: The viewer's input as JSON: ``viewer_data`` and ``full``.
         spz: The Gaussians as SPZ in base64.
         poster: The render of the initial camera, shown until the Gaussians are; None if there is
             none.
+        full: The link to a file with all Gaussians beside the page; None if the page has them.
     """
 
     shown: str
     data: Markup
     spz: str
     poster: Embedded | None = None
+    full: str | None = None
 
 
 def viewer_script() -> Markup:
@@ -75,12 +81,21 @@ def viewer_content(results: SceneResults, max_bytes: int) -> ViewerContent:
     centres = np.array([view.centre for view in results.trained.views]).reshape(-1, 3)
     # base64 makes 4 characters of 3 bytes.
     packed = fit(results.trained.gaussians, centres, max_bytes * 3 // 4)
+    full = FULL if len(results.trained.gaussians) > MAX_GAUSSIANS else None
     return ViewerContent(
         shown=_shown(results.trained.gaussians, packed),
-        data=htmlsafe_json_dumps(viewer_data(results), separators=(",", ":")),
+        data=htmlsafe_json_dumps(viewer_data(results) | {"full": full}, separators=(",", ":")),
         spz=_base64(packed.spz),
         poster=viewer_poster(results),
+        full=full,
     )
+
+
+def write_all(results: SceneResults, folder: Path) -> None:
+    """Write all Gaussians to ``scene.spz`` in the folder ``report``, if the page has not all."""
+    gaussians = sized_for_spz(results).trained.gaussians
+    if len(gaussians) > MAX_GAUSSIANS:
+        write_bytes(folder / PurePosixPath(FULL).name, encoded(gaussians))
 
 
 def viewer_poster(results: SceneResults) -> Embedded | None:

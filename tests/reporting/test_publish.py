@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.io.spz import decode_spz
 from pipeline.reporting.page import write_report
 from pipeline.reporting.publish import downloads, publish
+from pipeline.reporting.space import FULL
 from pipeline.runtime.errors import UserError
-from tests.reporting.made import report
+from tests.reporting.made import gaussians, report, trained
 
 
 @pytest.fixture
@@ -50,3 +52,19 @@ def test_a_folder_of_something_else_and_incomplete_scenes_are_refused(
     with pytest.raises(UserError, match="missing"):
         publish(scene, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_the_gaussians_of_a_large_scene_are_published_beside_the_page(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than the page has: all of them, in the file that the page loads on a web server."""
+    monkeypatch.setattr("pipeline.reporting.fit.MAX_GAUSSIANS", 100)
+    monkeypatch.setattr("pipeline.reporting.space.MAX_GAUSSIANS", 100)
+    large = report(trained=trained(gaussians=gaussians(400)))
+    write_report(large, scene / "report" / "report.html")
+    (scene / "report" / "report.html").replace(scene / "report.html")
+    html = (scene / "report.html").read_text("utf-8")
+    assert "the 100 most prominent" in html and "connect-src 'self'" in html
+    publish(scene, tmp_path / "barn")
+    assert len(decode_spz((tmp_path / "barn" / FULL).read_bytes())) == 400
+    publish(scene, tmp_path / "barn")

@@ -270,6 +270,25 @@ function start(data) {
     stage.redraw();
   });
 
+  // All Gaussians, where the page has only some and the file beside it can be had. Browsers read no
+  // files beside a page that is a file itself.
+  async function complete() {
+    await ready;
+    const say = text => { document.getElementById("space-full").textContent = text; };
+    if (location.protocol === "file:") return say("All of them show when the page is on a web server.");
+    say("Loading all of them…");
+    try {
+      const response = await fetch(data.full);
+      if (!response.ok) throw new Error(response.statusText || response.status);
+      await stage.replace(new Uint8Array(await response.arrayBuffer()));
+      if (crop.visible) crop.activate(true);
+      await stage.settled();
+      say("All of them are shown.");
+    } catch (error) {
+      say(`The rest could not be loaded: ${error.message ?? error}.`);
+    }
+  }
+
   async function picture(camera) {
     await ready;
     try {
@@ -291,5 +310,6 @@ function start(data) {
     };
   }
 
-  return { ready, look, picture, state, settled: () => stage.settled() };
+  const full = data.full ? complete() : ready;
+  return { ready, full, look, picture, state, settled: () => stage.settled() };
 }

@@ -9,6 +9,7 @@ import { Surface } from "./surface.js";
 const FAR = 1e4;
 // Gaussians fade between these multiples of the scene's reach when the viewpoint leaves its hull.
 const FADE = [1.1, 1.6];
+const DRAWN = 5e5, DRAWN_BY_PHONES = 2e5; // Gaussians at once of a file beside the page
 
 export function bytes(base64) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64);
@@ -45,26 +46,45 @@ export class Stage {
       maxPixelRadius: Infinity,
       sortRadial: false,
       accumExtSplats: true,
-      enableLod: false,
+      enableLod: Boolean(data.full),
+      lodSplatCount: matchMedia("(pointer: coarse)").matches ? DRAWN_BY_PHONES : DRAWN,
     });
     projectAsRasterizer(this.spark);
-    this.splats = new SplatMesh({
-      fileBytes: bytes(document.getElementById("splats").textContent),
-      extSplats: true,
-    });
-    frame.decompose(this.splats.position, this.splats.quaternion, this.splats.scale);
-    this.#fadeOutside();
-    this.#hideOutsideBox();
+    this.#modifiers = [this.#boxModifier(), this.#fadeModifier()];
+    this.splats = this.#mesh({ fileBytes: bytes(document.getElementById("splats").textContent) });
     this.points = sparsePoints(data);
     this.points.visible = false;
     this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
   }
 
-  #fadeOutside() {
+  // The modifiers of Gaussians in the world's coordinates, and in those of the page's frame.
+  #modifiers;
+
+  #mesh(options) {
+    const [objectModifier, worldModifier] = this.#modifiers;
+    const mesh = new SplatMesh({ extSplats: true, objectModifier, worldModifier, ...options });
+    this.frame.decompose(mesh.position, mesh.quaternion, mesh.scale);
+    return mesh;
+  }
+
+  // Show the Gaussians of a file instead. Of many, a tree of merged ones bounds how many are drawn.
+  async replace(fileBytes) {
+    const mesh = this.#mesh({ fileBytes, lod: true, nonLod: true });
+    await mesh.initialized;
+    const { splats } = this;
+    mesh.visible = splats.visible;
+    this.scene.remove(splats).add(mesh);
+    this.splats = mesh;
+    this.seen = null;
+    splats.dispose();
+    this.redraw();
+  }
+
+  #fadeModifier() {
     this.fade = new dyno.DynoFloat({ value: 0 });
     const { reach, centre } = this.coverage;
     const number = value => dyno.dynoConst("float", value);
-    this.splats.worldModifier = dyno.dynoBlock(
+    return dyno.dynoBlock(
       { gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
         const { center, opacity } = dyno.splitGsplat(gsplat).outputs;
         const distance = dyno.length(dyno.sub(center, dyno.dynoConst("vec3", centre)));
@@ -81,12 +101,11 @@ export class Stage {
     this.splats.updateVersion();
   }
 
-  // An object modifier's coordinates are the world's.
-  #hideOutsideBox() {
+  #boxModifier() {
     const corner = value => new dyno.DynoVec3({ value: new THREE.Vector3().setScalar(value) });
     this.low = corner(-Infinity);
     this.high = corner(Infinity);
-    this.splats.objectModifier = dyno.dynoBlock(
+    return dyno.dynoBlock(
       { gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
         const { center, opacity } = dyno.splitGsplat(gsplat).outputs;
         const inside = dyno.and(dyno.all(dyno.lessThanEqual(this.low, center)),

@@ -20,7 +20,7 @@ from pipeline.scene.georeference import GeographicOrigin, Georeference, Residual
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.sfm.georeference import summary
-from pipeline.surface.path import describe_path
+from pipeline.surface.path import VideoPath, describe_path
 from tests.metrics.test_evaluation import ERROR
 from tests.reporting.made import coverage, evaluation, gaussians, metrics, ring
 from tests.reporting.test_page import NO_SURFACE
@@ -53,7 +53,7 @@ FILES: list[JsonFile] = [
     GPS,
     describe_frame(gaussians(), ring(), np.array([0.0, 0, 1]), RENDER, ["point_cloud.glb"], GPS),
     describe_frame(gaussians(), ring(), np.array([0.0, 0, 1]), RENDER, [], None),
-    describe_path(ring(), 30),
+    describe_path(VideoPath(ring(), 30, "")),
     *([GIVEN] if GIVEN is not None else []),
 ]
 

@@ -18,7 +18,6 @@ from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
 from pipeline.scene.normalization import Normalization
-from pipeline.splats.arrays import GaussianRows, collect
 from pipeline.splats.gaussians import Gaussians
 from tests.reporting.made import gaussians, report, trained
 from tests.reporting.test_viewer import browser, page, pixels, state
@@ -43,10 +42,10 @@ def test_the_options_given_back_export_exactly_what_is_shown(page: Any, tmp_path
     region = Export.model_validate(options["export"]).region
     assert list(region) == state(page)["crop"] and region[0] > subject[0] + 0.05
     exported = scene.gaussians.scaled(0.5)
-    rows = select_gaussians(exported, None, region, [], RasterOptions()).rows
-    assert 100 < len(rows) < 2500
-    assert page.locator(".crop .count").inner_text() == f"{len(rows):,} Gaussians in the box"
-    kept = Gaussians.sharing(collect(GaussianRows(scene.gaussians, rows, 3)))
+    chosen = select_gaussians(exported, None, region, [], RasterOptions()).gaussians
+    assert 100 < len(chosen) < 2500
+    assert page.locator(".crop .count").inner_text() == f"{len(chosen):,} Gaussians in the box"
+    kept = Gaussians.sharing(chosen.scaled(2))
     for view in scene.views[:2]:
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
         drawn = pixels(base64.b64decode(url.partition(",")[2]))

@@ -14,6 +14,7 @@ from pipeline.config.export import (
     MAX_MEASURED_LOSSES,
     MAX_TEXTURE_PX,
     RENDERED_FORMATS,
+    SURVEY_FORMATS,
 )
 from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
 from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
@@ -49,6 +50,8 @@ _STEREO, _FUSION, _CACHED_VIEWS = 320.0, 150.0, 170.0
 # The points of the fused cloud as a share of the pixels, and their maximum in millions. Bytes of a
 # point, and of a point of the sample that is thinned.
 _FUSED_SHARE, _MAX_FUSED, _FUSED, _SAMPLED = 0.25, 5.0, 30.0, 150.0
+# Bytes of a point of the fused cloud in a map, and per pixel of the photographs that are cached.
+_MAPPED, _CACHED_PHOTOS = 220.0, 60.0
 # The number of photographs whose features are in memory at a time while pairs are matched; MB per
 # photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
 _KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
@@ -257,6 +260,8 @@ def _export(plan: Plan, threads: int) -> float:
     selected = export.max_gaussians is not None or export.region is not None
     if not {"sog_lod", "tiles3d"}.isdisjoint(export.formats):
         written += _LEVELS * min(1.0, 1e6 * _gaussians(plan) / _CHUNK)
+    if not SURVEY_FORMATS.isdisjoint(export.formats):
+        written += _MAPPED * _fused_points(plan) + _CACHED_PHOTOS * _pixels(plan)
     needed = [written]
     if not set(LOSSY_FORMATS).isdisjoint(export.formats):
         read = _READ_AGAIN * min(_gaussians(plan), MAX_MEASURED_LOSSES / 1e6)

@@ -133,6 +133,13 @@ def test_levels_of_detail_reserve_what_the_largest_chunk_takes(gaussians: int, u
         assert used <= memory_mb("export", plan_of(scene, config), 2) <= 1.5 * used, name
 
 
+def test_maps_reserve_what_their_cloud_takes() -> None:
+    """A cloud of 2.8 million points, where the plan expects the most that there can be."""
+    scene = Scene(75, (1296, 972), (640, 480), 76_800)
+    config = Config.model_validate({"export": {"formats": ["ply", "ortho", "laz"]}})
+    assert 800 <= memory_mb("export", plan_of(scene, config), 2) <= 2.2 * 800
+
+
 def test_jobs_that_estimate_depth_maps_reserve_what_they_take() -> None:
     """With one thread; 28 of 32 and 21 of 25 photographs are training views."""
     config = Config.model_validate({"preset": "fast", "init": {"method": "dense"}})

@@ -21,6 +21,7 @@ from scipy.ndimage import distance_transform_edt, minimum_filter
 
 from pipeline.config.export import MAX_TEXTURE_PX
 from pipeline.photos.load import load_view
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.progress import track
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
@@ -111,7 +112,8 @@ def texture_mesh(
     usual = float(np.median(density[density > 0])) if density.any() else 1 / voxel
     # Unseen triangles, which have the colour of those beside them, need few texels.
     density = np.maximum(density, UNSEEN * usual)
-    atlas = cut_and_pack(vertices, faces, density, texture_px or MAX_TEXTURE_PX)
+    # In a process of its own: xatlas crashes on some meshes.
+    atlas = run_isolated(cut_and_pack, vertices, faces, density, texture_px or MAX_TEXTURE_PX)
     baker = _Baker(sight, atlas)
     first = baker.mean(track(photographs, "texture", len(photographs.views), unit="views"), threads)
     again = track(photographs, "texture, second mean", len(photographs.views), unit="views")

@@ -14,6 +14,7 @@ from pipeline.config.export import Export
 from pipeline.config.video import VideoExport
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
+from pipeline.runtime.isolate import ProcessDied
 from pipeline.runtime.progress import track
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
@@ -104,7 +105,8 @@ def write_rendered(
                     textured = make_texture(
                         made, photographs, config.texture_px, options.threads, messages
                     )
-                    write_mesh_glb(out / "mesh.glb", textured, up)
+                    if textured is not None:
+                        write_mesh_glb(out / "mesh.glb", textured, up)
     if "video" in formats:
         _write_video(out, config.video, gaussians, views, options, up, origin, messages)
     return messages
@@ -172,14 +174,21 @@ def make_mesh(
 
 def make_texture(
     made: Made, photographs: Photographs, most_px: int | None, threads: int, messages: Messages
-) -> TexturedMesh:
-    """The mesh with a texture.
+) -> TexturedMesh | None:
+    """The mesh with a texture; None, with a warning, if it cannot be cut into charts.
 
     Args:
         most_px: The argument of ``texture_mesh``.
         messages: The messages that those about the texture are added to.
     """
-    textured = texture_mesh(made.mesh, photographs, made.voxel, most_px, threads)
+    try:
+        textured = texture_mesh(made.mesh, photographs, made.voxel, most_px, threads)
+    except ProcessDied:
+        messages.warnings.append(
+            "no mesh.glb: the mesh cannot be cut into charts for a texture; mesh.ply has colours at "
+            "its vertices. Another export.mesh_voxel or export.mesh_faces may help"
+        )
+        return None
     height, width = textured.picture.shape[:2]
     messages.decisions.append(
         f"texture: {width}x{height} pixels from {len(photographs.views)} photographs"

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from snakemake.cli import get_argument_parser, parse_config
 
+from pipeline.config.export import PLACED_FORMATS
 from pipeline.coverage.record import CoverageRecord
 from pipeline.io.frame_json import Frame
 from pipeline.metrics.evaluation import Evaluation

@@ -185,8 +185,8 @@ def make_texture(
         textured = texture_mesh(made.mesh, photographs, made.voxel, most_px, threads)
     except ProcessDied:
         messages.warnings.append(
-            "no mesh.glb: the mesh cannot be cut into charts for a texture; mesh.ply has colours at "
-            "its vertices. Another export.mesh_voxel or export.mesh_faces may help"
+            "no mesh.glb: the mesh cannot be cut into charts for a texture; mesh.ply has colours "
+            "at its vertices. Another export.mesh_voxel or export.mesh_faces may help"
         )
         return None
     height, width = textured.picture.shape[:2]

@@ -232,7 +232,7 @@ class Scene:
                 photographs = Photographs(views, self._posed.gains)
                 textured = make_texture(made, photographs, None, self._threads, messages)
                 if textured is None:
-                    raise UserError(messages.warnings[-1], file=file, fix="write a .ply file")
+                    raise UserError(messages.warnings[-1], file=path, fix="write a .ply file")
                 write_mesh_glb(path, textured, self.up)
         warn(said)
         return made.mesh

@@ -81,7 +81,7 @@ def read_las(path: Path) -> Chunks:
     count_las(path)
     try:
         # Not whatever other decoder is installed: its errors are of other kinds.
-        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        with laspy.open(path, laz_backend=laspy.LazBackend.LazrsParallel) as reader:
             for points in reader.chunk_iterator(CHUNK_POINTS):
                 xyz = stacked([points.x, points.y, points.z], np.float64)
                 if "red" not in set(points.point_format.dimension_names):

@@ -19,7 +19,9 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 from pipeline.runtime import progress
@@ -50,6 +52,9 @@ class Limits:
 
 _UNLIMITED = Limits()
 
+#: Held while ``__main__`` is hidden from a process that starts.
+_MAIN_MODULE = threading.Lock()
+
 
 class ProcessDied(RuntimeError):
     """The process of a function ended without a result: a crash of native code."""
@@ -62,9 +67,9 @@ class OverLimitError(ProcessDied):
 def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
     """Call ``function(*args, **kwargs)`` in a new (spawned) process and return its value.
 
-    The function, its arguments and its value must be picklable; the new process imports the
-    function's module only. Progress is written to the same file. The process ends when the calling
-    process ends, even by SIGKILL.
+    The function, its arguments and its value must be picklable. The new process imports the
+    function's module only: a program of the user's needs no ``if __name__ == "__main__"``. Progress
+    is written to the same file. The process ends when the calling process ends, even by SIGKILL.
 
     Raises:
         UserError: The function raised it.
@@ -91,7 +96,7 @@ def run_limited(limits: Limits, function: Callable[..., T], /, *args: Any, **kwa
     process = context.Process(
         target=_child, args=(sender, parent_alive, progress._file, limits, call)
     )
-    process.start()
+    _start(process, function)
     sender.close()
     parent_alive.close()
     name = function.__qualname__
@@ -117,6 +122,20 @@ def run_limited(limits: Limits, function: Callable[..., T], /, *args: Any, **kwa
         raise RuntimeError(f"{name} failed:\n{value}")
     result: T = value
     return result
+
+
+def _start(process: BaseProcess, function: Callable[..., Any]) -> None:
+    """Start the process without the main module, which ``multiprocessing`` would run again."""
+    if function.__module__ == "__main__":
+        process.start()
+        return
+    with _MAIN_MODULE:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            process.start()
+        finally:
+            sys.modules["__main__"] = main
 
 
 def _child(

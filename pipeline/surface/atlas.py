@@ -44,22 +44,25 @@ def cut_and_pack(vertices: Array, faces: NDArray[np.int64], density: Array, most
         most: The largest width and height of the texture.
     """
     area = _areas(vertices, faces)
+    wanted = float((area * density**2).sum())
+    # More texels than the texture has are not needed, and float32 has a largest number.
+    density = density * min(1.0, most / np.sqrt(max(wanted, 1e-300)))
     atlas = xatlas.Atlas()
     parts = split(vertices[faces].mean(axis=1), PART)
     locals_ = []
-    needed = 0.0
     for part in parts:
         used, local = np.unique(faces[part], return_inverse=True)
         texels = float((area[part] * density[part] ** 2).sum())
         scale = np.sqrt(texels / max(float(area[part].sum()), 1e-300))
-        needed += texels
         # Around an origin of its own, to keep float32's precision.
         points = (vertices[used] - vertices[used].mean(axis=0)) * scale
         atlas.add_mesh(points.astype(np.float32), local.reshape(-1, 3).astype(np.uint32))
         locals_.append(used)
     options = xatlas.PackOptions()
     options.padding = PADDING
-    options.resolution = int(np.clip(np.sqrt(needed / 0.7), 32, most))
+    options.resolution = int(np.clip(np.sqrt(wanted / 0.7), 32, most))
+    # Packing a chart much larger than the texture takes memory without end.
+    options.max_chart_size = options.resolution
     atlas.generate(xatlas.ChartOptions(), options)
     source, triangles, coordinates, count = [], [], [], 0
     for number, used in enumerate(locals_):

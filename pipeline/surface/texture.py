@@ -193,8 +193,10 @@ class _Sight:
             drawn = self.draw(view)
             rows = self.candidates(view, drawn)
             _, _, z = camera_space(view, self.centre[rows])
+            # The centre of a large triangle may be beside or behind the camera, unseen.
+            closest = 1 / max(float(drawn.inverse_depth.max()), 1e-30)
             cosine = self.facing(view, self.centre[rows], self.normal[rows])
-            pixels = np.sqrt(view.fx * view.fy * np.clip(cosine, 0, 1)) / np.maximum(z, 1e-9)
+            pixels = np.sqrt(view.fx * view.fy * np.clip(cosine, 0, 1)) / np.maximum(z, closest)
             best[rows] = np.maximum(best[rows], pixels)
         return best
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import socket
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +19,21 @@ from tests.sfm import jobs
 
 def test_the_value_is_returned():
     assert run_isolated(jobs.returned, {"a": [1, 2]}) == {"a": [1, 2]}
+
+
+def test_a_program_without_a_main_guard_is_not_run_again(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(
+        "print('started')\n"
+        "from pipeline.runtime.isolate import run_isolated\n"
+        "from tests.sfm import jobs\n"
+        "print(run_isolated(jobs.returned, 1))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, program], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert (done.stdout, done.returncode) == ("started\n1\n", 0), done.stderr
 
 
 def test_a_user_error_keeps_its_fields():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.runtime.isolate import Limits, run_limited
 from pipeline.scene.exposure import ExposureGains, ViewLight
 from pipeline.surface.atlas import PART, cut_and_pack, split
 from pipeline.surface.mesh import Mesh, vertex_normals
@@ -209,6 +210,33 @@ def test_charts_do_not_overlap_and_keep_the_triangles():
     drawn = draw_triangles(atlas.uv, np.ones(len(atlas.uv)), atlas.faces, *atlas.size)
     assert (drawn.face >= 0).sum() == pytest.approx(area, rel=0.02)
     assert area == pytest.approx(6 * 50**2, rel=0.25)
+
+
+def test_a_chart_larger_than_the_texture_is_made_smaller():
+    """Packing it as it is took memory without end."""
+    mesh = box()
+    faces = mesh.faces.astype(np.int64)
+    density = np.full(len(faces), 50.0)
+    density[:8] = 1e13
+    limits = Limits(seconds=120, memory=2 << 30)
+    atlas = run_limited(limits, cut_and_pack, mesh.vertices.astype(float), faces, density, 500)
+    assert max(atlas.size) <= 500
+    # Its texels are used well: charts of triangles that are drawn somewhere.
+    drawn = draw_triangles(atlas.uv, np.ones(len(atlas.uv)), atlas.faces, *atlas.size)
+    assert (drawn.face >= 0).mean() > 0.2
+
+
+def test_a_triangle_under_the_camera_gets_few_texels(tmp_path):
+    """The view sees one of its corners; its centre is behind the camera."""
+    (view,) = ring(tmp_path, count=1)
+    corners = np.array([[-1.0, 0.6, -2.2], [0.8, 0.6, 2.0], [1.0, 0.6, -2.2]])
+    corners = corners @ view.world_to_camera[:3, :3] + view.centre
+    faces = np.array([[0, 1, 2], [0, 2, 1]])
+    parts = [(corners, faces), (box().vertices.astype(float), box().faces.astype(int))]
+    textured = texture_mesh(joined(parts), Photographs([view]), 0.02, 300, threads=1)
+    _, face, _ = texels(textured)
+    under = np.abs(textured.vertices[textured.faces[face]]).max(axis=(1, 2)) > 0.6
+    assert 0 < under.sum() < 0.7 * len(face)
 
 
 def test_parts_are_of_neighbours():

@@ -27,7 +27,7 @@ from benchmarks.results import LightResult
 from pipeline.config.density import Gradient
 from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Evaluate, Split, Views
-from pipeline.config.settled import Init, TrainOptions
+from pipeline.config.settled import Background, Init, TrainOptions
 from pipeline.demo.capture import Conditions
 from pipeline.demo.options import picture_size
 from pipeline.demo.write import WITHHELD, DemoSpec, write_demo
@@ -179,11 +179,11 @@ def measure(setup: Setup, world: str, seed: int) -> LightResult:
     )
 
 
-def first_of(scene: SceneData, seed: int) -> Gaussians:
+def first_of(scene: SceneData, seed: int, background: Background = "black") -> Gaussians:
     """The Gaussians that training starts with."""
     training = [view for view in scene.views if not view.is_test]
     points = InitPoints(scene.model.points)
-    first = first_gaussians(points, training, Init(), InitExperiments(), seed)
+    first = first_gaussians(points, training, Init(), InitExperiments(), seed, background)
     return Gaussians.from_arrays(first.gaussians.arrays())
 
 

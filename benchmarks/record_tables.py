@@ -103,7 +103,8 @@ def surface(found: Sequence[SurfaceResult]) -> str:
     rows = [
         [
             *("depths", "triangles", "vertices off (mm)", "surface off (mm)", "90 % within (mm)"),
-            *("complete (%)", "vertex colours (dB)", "texture (dB)", "texture (px)"),
+            *("complete (%)", "thin parts (%)", "vertex colours (dB)", "texture (dB)"),
+            "texture (px)",
             *("mesh (s)", "texture (s)"),
         ]
     ]
@@ -111,8 +112,9 @@ def surface(found: Sequence[SurfaceResult]) -> str:
         errors = (f"{value:.1f}" for value in (r.vertex_error_mm, r.error_mm, r.p90_mm))
         colours = (f"{r.psnr_vertices:.1f}", cell(r.psnr_texture, ".1f"), str(r.texture_px or "-"))
         times = (f"{r.mesh_s:.0f}", cell(r.texture_s, ".0f"))
-        complete = f"{100 * r.completeness:.1f}"
-        rows.append([r.depths, f"{r.triangles:,}", *errors, complete, *colours, *times])
+        thin = None if r.thin_completeness is None else 100 * r.thin_completeness
+        complete = (f"{100 * r.completeness:.1f}", cell(thin, ".1f"))
+        rows.append([r.depths, f"{r.triangles:,}", *errors, *complete, *colours, *times])
     return markdown.table(rows)
 
 

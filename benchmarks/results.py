@@ -417,7 +417,7 @@ class LightResult:
 
 @dataclass(frozen=True)
 class SurfaceResult:
-    """A mesh of the demo scene.
+    """A mesh of a synthetic scene.
 
     Attributes:
         depths: The depth maps: "rendered" alone, or "both" with those of multi-view stereo.
@@ -433,6 +433,8 @@ class SurfaceResult:
         texture_px: The larger of the texture's width and height; 0 without one.
         mesh_s, texture_s, train_s, dense_s: The times of the mesh and its texture, of training and
             of multi-view stereo.
+        thin_completeness: ``completeness`` of the parts that are thin (``true_surface.THIN``); None
+            where they are not told apart.
     """
 
     seed: int
@@ -452,6 +454,8 @@ class SurfaceResult:
     texture_s: float | None
     train_s: float
     dense_s: float
+    scene: str = "demo"
+    thin_completeness: float | None = None
 
 
 # ---- benchmarks.levels ----

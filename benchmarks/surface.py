@@ -1,6 +1,7 @@
-"""Accuracy, completeness and colours of meshes of the demo scene, whose true surface is known.
+"""Accuracy, completeness and colours of meshes of scenes whose true surface is known.
 
     python -m benchmarks.surface --size 320x240 --json RECORD.json
+    python -m benchmarks.surface --scene town --size 480x320 --views 60 --json RECORD.json
 
 The scene is trained with its exact poses and points, and depths are estimated by multi-view stereo.
 Meshes are made from the rendered depths alone and from both, with all triangles of marching cubes
@@ -25,12 +26,14 @@ from scipy.spatial import cKDTree
 
 from benchmarks.light import Setup, first_of, read_scene, write_world
 from benchmarks.measured import add_record_options, measured, write_record
-from benchmarks.mesh_accuracy import Similarity, sample, true_points
+from benchmarks.mesh_accuracy import sample
 from benchmarks.record_tables import surface
 from benchmarks.results import SurfaceResult
+from benchmarks.town.write import TownSpec, write_town
+from benchmarks.true_surface import TrueSurface, demo_surface, town_surface
 from pipeline.config.schema import Split
+from pipeline.config.settled import Background
 from pipeline.demo.options import picture_size
-from pipeline.demo.scene import distance
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.dense import reconstruct
 from pipeline.photos.load import load_view
@@ -52,8 +55,6 @@ Colours = Callable[[NDArray[np.integer], Array], NDArray[np.floating]]
 SAMPLES = 200_000
 #: The shares of the triangles of marching cubes.
 SHARES = (1.0, 0.5, 0.125)
-#: The poses are exact.
-FRAME = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -61,26 +62,45 @@ class Scene:
     """The trained scene.
 
     Attributes:
-        truth: (P, 3) points of the true surface.
+        truth: The true surface.
         dense: The folder of the dense stage.
     """
 
     data: SceneData
     renders: RenderCache
-    truth: Array
+    truth: TrueSurface
     dense: Path
     train_s: float
     dense_s: float
 
 
-def prepare(setup: Setup, folder: Path, seed: int) -> Scene:
+def write_scene(name: str, setup: Setup, seed: int) -> Path:
+    """The folder of the photographs, which are written unless they are there."""
+    if name == "demo":
+        return write_world(setup, "plain", seed)
+    width, height = setup.size
+    folder = setup.work / f"town_{setup.views}_{width}x{height}_{seed}"
+    if not folder.exists():
+        spec = TownSpec(setup.views, width, height, "none", poses="colmap", seed=seed)
+        write_town(folder, spec, usable_cores())
+    return folder
+
+
+def prepare(name: str, setup: Setup, folder: Path, seed: int) -> Scene:
     """Train the scene and estimate its depths."""
-    scene = read_scene(write_world(setup, "plain", seed))
+    photographs = write_scene(name, setup, seed)
+    scene = read_scene(photographs)
     options, threads = setup.options(), usable_cores()
+    # As the pipeline chooses where photographs show sky, which is not a surface.
+    background: Background = "skybox" if name == "town" else "black"
+    if name == "town":
+        options = options.model_copy(update={"background": background})
     training = [view for view in scene.views if not view.is_test]
     start = time.perf_counter()
     run = TrainingRun(options, folder / "training", seed=seed, threads=threads)
-    gaussians: Gaussians = train_scene(scene, first_of(scene, seed), run).result.gaussians
+    gaussians: Gaussians = train_scene(
+        scene, first_of(scene, seed, background), run
+    ).result.gaussians
     trained = time.perf_counter()
     for name in ("dense", "scratch"):
         (folder / name).mkdir()
@@ -88,14 +108,14 @@ def prepare(setup: Setup, folder: Path, seed: int) -> Scene:
     done = time.perf_counter()
     raster = choose_protocol(scene.views, Split(), options).options(options, threads)
     renders = RenderCache(gaussians, scene.views, raster, folder / "renders")
-    truth = true_points(scene.views, FRAME)
+    truth = demo_surface(scene.views) if name == "demo" else town_surface(photographs, scene.views)
     return Scene(scene, renders, truth, folder / "dense", trained - start, done - trained)
 
 
-def results(scene: Scene, size: str, seed: int) -> Iterator[SurfaceResult]:
+def results(scene: Scene, name: str, size: str, seed: int) -> Iterator[SurfaceResult]:
     """One result for each kind of depths and share of triangles."""
     voxel, threads = None, usable_cores()
-    for name, dense in (("rendered", None), ("both", scene.dense)):
+    for depths, dense in (("rendered", None), ("both", scene.dense)):
         maps, count = DepthMaps(scene.renders, dense), 10**9
         for share in SHARES:
             start = time.perf_counter()
@@ -110,21 +130,22 @@ def results(scene: Scene, size: str, seed: int) -> Iterator[SurfaceResult]:
                 photographs = Photographs(scene.data.views)
                 textured = texture_mesh(mesh, photographs, voxel, None, threads)
             points = sample(mesh.vertices.astype(np.float64), mesh.faces, SAMPLES)
-            error = np.abs(distance(points.T))
-            missing, _ = cKDTree(points).query(scene.truth)
+            error = scene.truth.distance(points)
+            missing, _ = cKDTree(points).query(scene.truth.points)
+            found, thin = missing < 2 * voxel, scene.truth.thin
             tests = [view for view in scene.data.views if view.is_test]
             yield SurfaceResult(
                 seed=seed,
                 pixels=size,
-                depths=name,
+                depths=depths,
                 share=share,
                 triangles=len(mesh.faces),
                 voxel_mm=1000 * voxel,
                 vertex_error_mm=1000
-                * float(np.median(np.abs(distance(mesh.vertices.T.astype(np.float64))))),
+                * float(np.median(scene.truth.distance(mesh.vertices.astype(np.float64)))),
                 error_mm=1000 * float(np.median(error)),
                 p90_mm=1000 * float(np.percentile(error, 90)),
-                completeness=float((missing < 2 * voxel).mean()),
+                completeness=float(found.mean()),
                 psnr_vertices=psnr_of(
                     mesh.vertices, mesh.faces, vertex_colours(mesh.colors), tests
                 ),
@@ -134,6 +155,8 @@ def results(scene: Scene, size: str, seed: int) -> Iterator[SurfaceResult]:
                 texture_s=None if textured is None else time.perf_counter() - made,
                 train_s=scene.train_s,
                 dense_s=scene.dense_s,
+                scene=name,
+                thin_completeness=float(found[thin].mean()) if thin.any() else None,
             )
 
 
@@ -211,6 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
+    add("--scene", choices=("demo", "town"), default="demo")
     add("--size", type=picture_size, default=(320, 240), metavar="WIDTHxHEIGHT")
     add("--views", type=int, default=32, help="photographs")
     add("--steps", type=int, default=1500)
@@ -226,7 +250,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         facts = measured("surface", asked.note, arguments)
         for seed in asked.seeds:
             with TemporaryDirectory() as folder:
-                found += results(prepare(setup, Path(folder), seed), size, seed)
+                scene = prepare(asked.scene, setup, Path(folder), seed)
+                found += results(scene, asked.scene, size, seed)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USER_ERROR

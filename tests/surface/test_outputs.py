@@ -24,6 +24,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.outputs import write_rendered
 from tests.surface.scenes import view_at
+from tests.surface.test_files import read_glb
 
 UP = np.array([0.0, 0.0, 1.0])
 needs_ffmpeg = pytest.mark.skipif(video.find_h264() is None, reason="no ffmpeg with H.264")
@@ -127,8 +128,10 @@ def test_the_number_of_triangles_and_the_size_of_the_texture_are_options(tmp_pat
     config = Export(formats=("mesh",), mesh_voxel=0.05, mesh_faces=700, texture_px=100)
     messages = write_rendered(tmp_path, config, ball, views, look(views), up=UP)
     assert int(messages.decisions[0].split()[1]) == pytest.approx(700, rel=0.05)
-    data = (tmp_path / "mesh.glb").read_bytes()
-    found = cv2.imdecode(np.frombuffer(data[data.index(b"\xff\xd8") :], np.uint8), 1)
+    document, _, body = read_glb((tmp_path / "mesh.glb").read_bytes())
+    at = document["bufferViews"][document["images"][0]["bufferView"]]
+    data = body[at["byteOffset"] :][: at["byteLength"]]
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert max(found.shape) <= 100
 
 

@@ -38,7 +38,6 @@ from pipeline.training.scene import train_scene
 
 RADIUS = 5.0  # The mean 3-sigma radius of synthetic Gaussians, pixels.
 FRAMES = 20  # The number of frames between two copies.
-OPTIONS = RasterOptions(background=(0.1, 0.2, 0.3))
 # The phases of ``benchmarks.gpu`` by the operators of ``benchmarks.raster.measure``.
 OPERATOR_OF = {"projection backward": "projection, SH backward", "Adam, statistics": "Adam"}
 
@@ -128,7 +127,9 @@ def frames(case: Case) -> Found:
     """Frames per second of the trained scene, with each copied to the processor and without."""
     scene, backend = trained(case.scene, case.size), backend_of(case)
     gpu, space = backend.gpu, Workspace(backend.gpu)
-    projected = backend.project(scene.gaussians, scene.camera, OPTIONS).projection
+    degree = round(scene.gaussians[4].shape[1] ** 0.5) - 1
+    options = RasterOptions(background=(0.1, 0.2, 0.3), sh_degree=degree)
+    projected = backend.project(scene.gaussians, scene.camera, options).projection
 
     def draw() -> None:
         for _ in range(FRAMES):
@@ -137,7 +138,7 @@ def frames(case: Case) -> Found:
         gpu.read(image.color, "f4", 1)
 
     def copied() -> object:
-        return backend.forward(*scene.gaussians, scene.camera, OPTIONS)
+        return backend.forward(*scene.gaussians, scene.camera, options)
 
     without, with_copy = median_seconds([draw, copied], case.turns)
     rates = {"frames_per_s": FRAMES / without, "copied_frames_per_s": 1 / with_copy}

@@ -127,12 +127,13 @@ def frames(case: Case) -> Found:
     """Frames per second of the trained scene, with each copied to the processor and without."""
     scene, backend = trained(case.scene, case.size), backend_of(case)
     gpu, space = backend.gpu, Workspace(backend.gpu)
+    count = 1 if gpu.adapter.kind == "software" else FRAMES
     degree = round(scene.gaussians[4].shape[1] ** 0.5) - 1
     options = RasterOptions(background=(0.1, 0.2, 0.3), sh_degree=degree)
     projected = backend.project(scene.gaussians, scene.camera, options).projection
 
     def draw() -> None:
-        for _ in range(FRAMES):
+        for _ in range(count):
             view = rasterise.project(space, projected.scene, projected.view, case.size)
             image = rasterise.blend(space, rasterise.list_pairs(space, view))
         gpu.read(image.color, "f4", 1)
@@ -141,7 +142,7 @@ def frames(case: Case) -> Found:
         return backend.forward(*scene.gaussians, scene.camera, options)
 
     without, with_copy = median_seconds([draw, copied], case.turns)
-    rates = {"frames_per_s": FRAMES / without, "copied_frames_per_s": 1 / with_copy}
+    rates = {"frames_per_s": count / without, "copied_frames_per_s": 1 / with_copy}
     return {**rates, "gaussians": float(scene.count)}, {}
 
 

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from benchmarks import markdown
 from benchmarks.budgets import tables as budget_tables
+from benchmarks.card import result as card
 from benchmarks.judge.truth import Grade
 from benchmarks.markdown import cell
 from benchmarks.measured import Record
@@ -307,6 +308,7 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
 
 #: Kind of table -> the type of the results in its records, and the function that makes the table.
 TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
+    "card": (card.CardResult, card.table),
     "memory": (MemoryResult, memory),
     "sfm": (summary.Run, lambda found: summary.table(summary.summaries(found))),
     "sfm.growth": (GrowthResult, growth),

@@ -5,6 +5,7 @@ The module imports nothing that could be missing (torch, pydantic, stages).
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import os
 import platform
@@ -25,6 +26,7 @@ PYTHON = (3, 11)
 LOW_DISK = 10 << 30
 LOW_MEMORY = 4 << 30
 VULKAN_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+VULKAN_LOADER = "libvulkan.so.1"
 _INSTALL = "make setup" if IS_CHECKOUT else "pip install splatmake"
 # The purpose of each distribution.
 NEEDED = {
@@ -203,9 +205,37 @@ def _graphics() -> list[Finding]:
     none = "none found; everything runs on the processor"
     return [
         *(gpu or ([] if vulkan else [Finding("GPU", none, "absent")])),
-        *(vulkan or [Finding("Vulkan", none, "absent")]),
+        *(vulkan or [Finding("Vulkan", none, "absent", _missing_driver(bool(gpu)))]),
+        *_missing_loader(),
         *_training_devices(bool(gpu or vulkan)),
     ]
+
+
+def _missing_driver(has_nvidia: bool) -> str | None:
+    """The fix for a system with wgpu and without the manifest of a Vulkan driver."""
+    if sys.platform != "linux" or find_spec("wgpu") is None:
+        return None
+    if has_nvidia:
+        return (
+            "the manifest nvidia_icd.json is missing: install all of NVIDIA's driver, or start the "
+            "container with NVIDIA_DRIVER_CAPABILITIES=all"
+        )
+    return (
+        "to train on a GPU, install the manufacturer's Vulkan driver (NVIDIA), or apt-get install "
+        "mesa-vulkan-drivers (AMD, Intel)"
+    )
+
+
+def _missing_loader() -> list[Finding]:
+    """The Vulkan loader if wgpu needs it and it is not installed."""
+    if sys.platform != "linux" or find_spec("wgpu") is None:
+        return []
+    try:
+        ctypes.CDLL(VULKAN_LOADER)
+    except OSError:
+        fix = "to train on a GPU, apt-get install libvulkan1 (Fedora: vulkan-loader)"
+        return [Finding("Vulkan loader", f"{VULKAN_LOADER} is not installed", "absent", fix)]
+    return []
 
 
 def _training_devices(has_graphics: bool) -> list[Finding]:

@@ -117,6 +117,22 @@ def test_graphics_devices_are_shown_as_not_used(bare, tmp_path):
     assert {finding.state for finding in found if finding.topic != "training"} == {"there"}
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="not run: libvulkan1 is Linux's")
+def test_the_packages_that_wgpu_lacks_are_named(bare, tmp_path, monkeypatch):
+    """On a server with wgpu alone: the loader and the driver's manifest, each with its package."""
+    monkeypatch.setattr(doctor, "find_spec", lambda name: object())
+    monkeypatch.setattr(doctor, "_training_devices", lambda has_graphics: [])
+    monkeypatch.setattr(doctor, "VULKAN_LOADER", "libvulkan-hidden.so.1")
+    found = {finding.topic: finding for finding in doctor._graphics()}
+    assert "libvulkan1" in str(found["Vulkan loader"].fix)
+    assert "mesa-vulkan-drivers" in str(found["Vulkan"].fix)
+    monkeypatch.setattr(doctor, "VULKAN_LOADER", "libc.so.6")
+    monkeypatch.setattr(doctor, "_output", lambda command: "NVIDIA X1, 8 GB, 1")
+    found = {finding.topic: finding for finding in doctor._graphics()}
+    assert "Vulkan loader" not in found
+    assert "NVIDIA_DRIVER_CAPABILITIES" in str(found["Vulkan"].fix)
+
+
 def test_the_device_that_trains_is_shown_with_the_reason(bare, tmp_path, monkeypatch):
     """A GPU if it is faster in the stored measurement; never one in software."""
     need_package("wgpu")

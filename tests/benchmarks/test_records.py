@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks import record_tables
+from benchmarks.card.result import CardResult
 from benchmarks.judge.truth import Truth
 from benchmarks.measured import Record, command_line, measured, write_record
 from benchmarks.results import (
@@ -76,6 +77,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
         ),
         "| fox | 7, 450x800 | 4 | 1 | 30.13 | 0.951 | 0.200 | 150k | 9000 | 4.1, 7.9 | "
         "1.2 | 2 | 1.9 |",
+    ),
+    "card": (
+        CardResult("step", "5 Gaussians, 96x64", "measured", "", 3.6, {"step_ms": 2.25}),
+        "| step | 5 Gaussians, 96x64 | 4 | step_ms 2.25 |",
     ),
     "scaling": (
         ScalingResult("town", 125, "features", 3, 60.4, 30.6, 210.0, 12.2),

@@ -29,6 +29,7 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.mesh_accuracy import sample
 from benchmarks.record_tables import surface
 from benchmarks.results import SurfaceResult
+from benchmarks.town.solids import UP
 from benchmarks.town.write import TownSpec, write_town
 from benchmarks.true_surface import TrueSurface, demo_surface, town_surface
 from pipeline.config.schema import Split
@@ -36,6 +37,7 @@ from pipeline.config.settled import Background
 from pipeline.demo.options import picture_size
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.dense import reconstruct
+from pipeline.photos.backdrop import SkyMasks
 from pipeline.photos.load import load_view
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.machine import usable_cores
@@ -63,12 +65,14 @@ class Scene:
 
     Attributes:
         truth: The true surface.
+        sky: The town's; the demo scene is a room.
         dense: The folder of the dense stage.
     """
 
     data: SceneData
     renders: RenderCache
     truth: TrueSurface
+    sky: SkyMasks | None
     dense: Path
     train_s: float
     dense_s: float
@@ -109,14 +113,15 @@ def prepare(name: str, setup: Setup, folder: Path, seed: int) -> Scene:
     raster = choose_protocol(scene.views, Split(), options).options(options, threads)
     renders = RenderCache(gaussians, scene.views, raster, folder / "renders")
     truth = demo_surface(scene.views) if name == "demo" else town_surface(photographs, scene.views)
-    return Scene(scene, renders, truth, folder / "dense", trained - start, done - trained)
+    sky = SkyMasks(training, scene.model.points.xyz, UP) if name == "town" else None
+    return Scene(scene, renders, truth, sky, folder / "dense", trained - start, done - trained)
 
 
 def results(scene: Scene, name: str, size: str, seed: int) -> Iterator[SurfaceResult]:
     """One result for each kind of depths and share of triangles."""
     voxel, threads = None, usable_cores()
     for depths, dense in (("rendered", None), ("both", scene.dense)):
-        maps, count = DepthMaps(scene.renders, dense), 10**9
+        maps, count = DepthMaps(scene.renders, dense, sky=scene.sky), 10**9
         for share in SHARES:
             start = time.perf_counter()
             mesh, grid = build_mesh(maps, voxel, threads, int(share * count))

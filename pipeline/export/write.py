@@ -439,7 +439,7 @@ def _write_rendered_formats(
         up=scene_up(scene.views, scene.manifest),
         origin=scene.normalization.origin,
         num_invented=scene.num_invented,
-        observed=Observed(scene.gains, dense, 1 / scale),
+        observed=Observed(scene.gains, dense, 1 / scale, scene.model.points.xyz),
     )
     report.decisions += messages.decisions
     report.warnings += messages.warnings

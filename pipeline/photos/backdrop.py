@@ -111,6 +111,35 @@ def measure_evidence(
     )
 
 
+class SkyMasks:
+    """The pixels of photographs that look like sky; none if too few photographs have any.
+
+    Args:
+        views, xyz, up: As those of ``measure_evidence``.
+
+    Raises:
+        UserError: See ``photos.load.load_view``.
+    """
+
+    def __init__(self, views: Sequence[View], xyz: NDArray[np.float64], up: NDArray[np.float64]):
+        xyz = xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
+        found = {}
+        for view in views:
+            picture = _picture(view)
+            found[view.name] = _to_the_edge(picture.rgb, sky_pixels(picture, xyz, up))
+        count = sum(bool(mask.any()) for mask in found.values())
+        enough = count >= max(MIN_SKY, SKY_SHARE * len(views))
+        self._found = found if enough else {}
+
+    def of(self, view: View) -> NDArray[np.bool_]:
+        """(H, W) bool, to a pixel of the reduced photograph."""
+        if view.name not in self._found:
+            return np.zeros((view.height, view.width), bool)
+        mask = self._found[view.name].astype(np.uint8)
+        size = (view.width, view.height)
+        return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
 def choose_background(evidence: Evidence) -> SceneBackground:
     """The background that the evidence speaks for."""
     if evidence.excluded >= ALONE_SHARE:
@@ -176,6 +205,15 @@ def sky_pixels(
         if region.mean() > MIN_REGION and bright and red - blue < REDNESS:
             found |= region
     return found
+
+
+def _to_the_edge(rgb: NDArray[np.float32], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The sky with the pixels beside it that have its colour there: points on the silhouettes of
+    buildings hid them."""
+    side = (2 * (POINT_DISTANCE + 1) + 1,) * 2
+    share = cv2.blur(sky.astype(np.float32), side)
+    nearby = cv2.blur(rgb * sky[..., None], side) / np.maximum(share, 1e-6)[..., None]
+    return np.asarray(sky | ((share > 1e-6) & (np.abs(rgb - nearby).max(2) < SMOOTH)))
 
 
 def _near_points(view: View, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.mvs.maps import DenseMap, read_map
+from pipeline.photos.backdrop import SkyMasks
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
 from pipeline.render import RasterOptions
@@ -23,6 +24,8 @@ from pipeline.splats.gaussians import Gaussians
 MIN_ALPHA = 0.5
 #: Least confidence of a depth of multi-view stereo that is preferred to the rendered one.
 MIN_CONFIDENCE = 0.25
+#: Where photographs match in more than this share of what looks like sky, it is a smooth wall.
+MAX_MATCHED = 0.1
 #: The weight of a depth of multi-view stereo with a confidence of 1, beside rendered ones, which
 #: weigh 1.
 DENSE_WEIGHT = 6.0
@@ -96,15 +99,22 @@ class DepthMaps:
     """Depth maps of the training views; can be iterated repeatedly.
 
     A depth is that of multi-view stereo where it is confident, else the rendered median. Masked
-    pixels are unknown (0); transparent pixels of a photograph are empty (inf).
+    pixels are unknown (0); transparent pixels of a photograph and sky are empty (inf).
 
     Args:
         dense: The folder of the dense stage; None for rendered depths alone.
         unit: The length of the dense stage's unit of length in the renders' unit.
+        sky: None: no pixel is sky.
     """
 
-    def __init__(self, renders: RenderCache, dense: Path | None = None, unit: float = 1.0):
-        self._renders, self._dense, self._unit = renders, dense, unit
+    def __init__(
+        self,
+        renders: RenderCache,
+        dense: Path | None = None,
+        unit: float = 1.0,
+        sky: SkyMasks | None = None,
+    ):
+        self._renders, self._dense, self._unit, self._sky = renders, dense, unit, sky
         self._count = sum(not view.is_test for view in renders.views)
 
     def __len__(self) -> int:
@@ -117,8 +127,15 @@ class DepthMaps:
                 continue
             photo = load_view(view)
             depth, weight = np.array(rendered.median), None
+            sky = np.zeros(depth.shape, bool) if self._sky is None else self._sky.of(view)
             if self._dense is not None:
-                depth, weight = self._combined(depth, read_map(self._dense, view.name))
+                dense = read_map(self._dense, view.name)
+                matched = dense.confidence >= MIN_CONFIDENCE
+                if sky.any() and matched[sky].mean() > MAX_MATCHED:
+                    sky[:] = False
+                depth, weight = self._combined(depth, dense, matched)
+                sky &= ~matched
+            depth[sky] = np.inf
             if photo.alpha is not None:
                 depth[photo.alpha == 0] = np.inf
             if photo.mask is not None:
@@ -126,12 +143,11 @@ class DepthMaps:
             yield DepthMap(view, depth, rendered.rgb, weight)
 
     def _combined(
-        self, rendered: NDArray[np.float32], dense: DenseMap
+        self, rendered: NDArray[np.float32], dense: DenseMap, matched: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The depths and their weights."""
-        chosen = dense.confidence >= MIN_CONFIDENCE
-        depth = np.where(chosen, dense.depth * np.float32(self._unit), rendered)
-        return depth, np.where(chosen, np.float32(DENSE_WEIGHT) * dense.confidence, np.float32(1))
+        depth = np.where(matched, dense.depth * np.float32(self._unit), rendered)
+        return depth, np.where(matched, np.float32(DENSE_WEIGHT) * dense.confidence, np.float32(1))
 
 
 def write_renders(folder: Path, renders: RenderCache) -> None:

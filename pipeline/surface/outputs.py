@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.export import Export
 from pipeline.config.video import VideoExport
+from pipeline.photos.backdrop import SkyMasks
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.isolate import ProcessDied
@@ -40,11 +41,14 @@ class Observed:
         gains: Their exposures.
         dense: The folder of the dense stage; None if it did not run.
         dense_unit: The length of the dense stage's unit in the unit of the Gaussians.
+        points: (P, 3) the sparse points in the world of the views, which tell sky from smooth
+            surfaces; None: nothing is sky.
     """
 
     gains: ExposureGains = NO_GAINS
     dense: Path | None = None
     dense_unit: float = 1.0
+    points: NDArray[np.float64] | None = None
 
 
 class Made(NamedTuple):
@@ -95,7 +99,12 @@ def write_rendered(
             if "depths" in formats:
                 write_depths(out / "depths", renders)
             if "mesh" in formats:
-                maps = DepthMaps(renders, observed.dense, observed.dense_unit)
+                sky = None
+                if observed.points is not None:
+                    sky = SkyMasks(
+                        [view for view in views if not view.is_test], observed.points, up
+                    )
+                maps = DepthMaps(renders, observed.dense, observed.dense_unit, sky)
                 made = make_mesh(
                     maps, config.mesh_voxel, config.mesh_faces, options.threads, messages
                 )

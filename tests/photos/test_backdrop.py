@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.photos.backdrop import Evidence, choose_background, measure_evidence
+from pipeline.photos.backdrop import Evidence, SkyMasks, choose_background, measure_evidence
 from pipeline.scene.background import SceneBackground
-from pipeline.scene.views import resized
+from pipeline.scene.views import View, resized
 from tests.splats.test_init import looking_at
 
 SIZE = 96
@@ -51,13 +51,13 @@ def before(colour: tuple[float, float, float]) -> Callable[[np.random.Generator]
     return draw
 
 
-def background_of(
+def scene(
     folder: Path,
     draw: Callable[[np.random.Generator], Image],
     turn: float = 60.0,
     kept: tuple[slice, slice] | None = None,
-) -> SceneBackground:
-    """The background of a scene of eight photographs, whose textured pixels have points.
+) -> tuple[list[View], NDArray[np.float64]]:
+    """Eight photographs, and points at their textured pixels.
 
     Args:
         draw: A function that returns a photograph.
@@ -87,7 +87,36 @@ def background_of(
         points.append(centre + (rotation.T @ (4 * ray)).T)
     # Points of one photograph would cover the sky of others: what is near is on the ground.
     xyz = np.concatenate(points)
-    return choose_background(measure_evidence(views, xyz[xyz[:, 1] < 0.7], UP))
+    return views, xyz[xyz[:, 1] < 0.7]
+
+
+def background_of(
+    folder: Path,
+    draw: Callable[[np.random.Generator], Image],
+    turn: float = 60.0,
+    kept: tuple[slice, slice] | None = None,
+) -> SceneBackground:
+    """The background of ``scene``."""
+    return choose_background(measure_evidence(*scene(folder, draw, turn, kept), UP))
+
+
+def test_the_sky_reaches_what_is_before_it(tmp_path: Path) -> None:
+    """Points on the edge hide no sky beside them."""
+    views, xyz = scene(tmp_path, under(BLUE))
+    masks = SkyMasks(views, xyz, UP)
+    for view in views:
+        sky = masks.of(view)
+        assert sky.shape == (SIZE, SIZE)
+        assert sky[: SIZE // 3].mean() > 0.85 and not sky[SIZE // 3 :].any()
+
+
+def test_few_photographs_with_a_bright_edge_have_no_sky(tmp_path: Path) -> None:
+    views, xyz = scene(tmp_path, texture)
+    assert not any(SkyMasks(views, xyz, UP).of(view).any() for view in views)
+    (tmp_path / "bright").mkdir()
+    bright, _ = scene(tmp_path / "bright", under(OVERCAST))
+    masks = SkyMasks([bright[0], *views[1:]], xyz, UP)
+    assert not masks.of(bright[0]).any()
 
 
 @pytest.mark.parametrize(

@@ -224,3 +224,29 @@ def test_ffmpeg_without_h264_is_not_used_and_its_failure_is_told(tmp_path, monke
     else:
         with pytest.raises(UserError, match="ffmpeg to encode the video, found: 3"):
             video.write_video(tmp_path / "video.mp4", frames, (64, 64), 30)
+
+
+class _UpperHalf:
+    """Sky in the upper half of each view."""
+
+    def of(self, view):
+        return np.indices((view.height, view.width))[0] < view.height // 2
+
+
+@pytest.mark.parametrize(("columns", "is_sky"), [(0, True), (6, True), (40, False)])
+def test_sky_has_no_surface_unless_photographs_match_there(tmp_path, ball, views, columns, is_sky):
+    """A smooth wall that looks like sky has matches in ``columns`` of the 80."""
+    depth = np.full((80, 80), 2.0, np.float32)
+    confidence = np.zeros((80, 80), np.float32)
+    confidence[:, :columns] = 0.9
+    for view in views:
+        write_map(tmp_path, view.name, DenseMap(depth, np.zeros((80, 80, 3)), confidence))
+    renders = RenderCache(ball, views, look(views), tmp_path / "drawn")
+    expected = {found.view.name: found for found in DepthMaps(renders, tmp_path)}
+    for found in DepthMaps(renders, tmp_path, sky=_UpperHalf()):
+        if found.view.mask is None:
+            assert (found.depth[:, :columns] == 2).all()
+            assert np.isinf(found.depth[:40, columns:]).all() == is_sky
+            assert np.array_equal(found.depth[40:], expected[found.view.name].depth[40:])
+    (first, *_) = DepthMaps(renders, sky=_UpperHalf())
+    assert np.isinf(first.depth[:40]).all() and not np.isinf(first.depth[40:]).any()

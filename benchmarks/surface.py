@@ -106,8 +106,8 @@ def prepare(name: str, setup: Setup, folder: Path, seed: int) -> Scene:
         scene, first_of(scene, seed, background), run
     ).result.gaussians
     trained = time.perf_counter()
-    for name in ("dense", "scratch"):
-        (folder / name).mkdir()
+    for part in ("dense", "scratch"):
+        (folder / part).mkdir()
     reconstruct(training, scene.model, folder / "dense", folder / "scratch", threads)
     done = time.perf_counter()
     raster = choose_protocol(scene.views, Split(), options).options(options, threads)

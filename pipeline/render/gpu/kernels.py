@@ -29,8 +29,12 @@ _IMPORT = re.compile(r"^#import (\w+)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Binding:
-    """One buffer of a kernel. ``kind``: ``uniform``, ``read`` or ``read_write``; ``only_written`` of
-    the last kind: no kernel of the module reads the buffer."""
+    """One buffer of a kernel.
+
+    Attributes:
+        kind: ``uniform``, ``read`` or ``read_write``.
+        only_written: Whether the kind is ``read_write`` but no kernel of the module reads it.
+    """
 
     number: int
     name: str

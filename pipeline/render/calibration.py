@@ -75,12 +75,13 @@ def made_scene(count: int) -> StepScene:
     return StepScene(gaussians, camera, (255 * uniform(HEIGHT, WIDTH, 3)).to(torch.uint8))
 
 
-def training_step(backend: Backend, scene: StepScene) -> Callable[[], object]:
-    """Return a function that makes a step, which can be repeated."""
+def training_step(backend: Backend, scene: StepScene, steps: int = 1) -> Callable[[], object]:
+    """Return a function that makes ``steps`` steps and waits for them, which can be repeated. The
+    operators of a backend make one step."""
     training = backend.resident()
     if training is None:
         return _by_operators(backend, scene, _optimised(scene))
-    return _resident(training, scene, _optimised(scene))
+    return _resident(training, scene, _optimised(scene), steps)
 
 
 def _optimised(scene: StepScene) -> Optimised:
@@ -94,7 +95,7 @@ def _optimised(scene: StepScene) -> Optimised:
 
 
 def _resident(
-    training: ResidentTraining, scene: StepScene, state: Optimised
+    training: ResidentTraining, scene: StepScene, state: Optimised, steps: int
 ) -> Callable[[], object]:
     training.load(state)
     step = ResidentStep(
@@ -109,7 +110,13 @@ def _resident(
         losses=None,
         adam={"frames": TWO_RATES, "sh": TWO_RATES, **dict.fromkeys(DENSE, RATE)},
     )
-    return lambda: training.step(step)
+
+    def step_and_wait() -> None:
+        for _ in range(steps):
+            training.step(step)
+        training.results()
+
+    return step_and_wait
 
 
 def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Callable[[], object]:

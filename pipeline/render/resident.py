@@ -148,9 +148,20 @@ class ResidentTraining(ABC):
         """Copy the tensors to the device."""
 
     @abstractmethod
-    def step(self, step: ResidentStep) -> StepResult:
+    def step(self, step: ResidentStep) -> None:
         """Render, compare, differentiate and update, as ``forward``, ``l1_ssim``, ``backward`` and
-        the optimiser's operators do."""
+        the optimiser's operators do. The device may do so later, but in order.
+
+        ``step.losses`` may be called more than once, and until the step's result is read.
+        """
+
+    @abstractmethod
+    def results(self) -> list[StepResult]:
+        """The results of the steps since the last call, in order; waits for them.
+
+        Raises:
+            UserError: The memory of the device does not suffice, or the device is lost.
+        """
 
     @abstractmethod
     def store(self, optimised: Optimised) -> None:

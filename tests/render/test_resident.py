@@ -16,6 +16,7 @@ from pipeline.render import (
     Surroundings,
     make_backend,
 )
+from pipeline.render.gpu.counts import Counts
 from pipeline.render.resident import Optimised, Planes, ResidentImage, ResidentStep
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.appearance.embedding import appearance_gradients, colour_offsets
@@ -163,7 +164,8 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
     ours, theirs, untouched = (State(step.embedding, name != "world's axes") for _ in range(3))
     training.load(ours.optimised)
     for number in (1, 2, 5):
-        found = training.step(replace(step, adam=ours.adam.rates(adam_step(number))))
+        training.step(replace(step, adam=ours.adam.rates(adam_step(number))))
+        (found,) = training.results()
         loss, cameras, d_embedding = by_operators(backend, theirs, step, number)
         assert found.loss == pytest.approx(loss, rel=1e-5)
         assert (found.camera is None) == (cameras is None)
@@ -183,6 +185,59 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
             assert torch.equal(tensor, theirs.tensors()[key]), key
     assert (ours.seen == 3).any() and (ours.adam.last == 5).any()
     assert not torch.equal(ours.gaussians.means, untouched.gaussians.means)
+
+
+VIEWS = [CAMERA, camera(WIDTH, HEIGHT), camera(2 * WIDTH, 3 * HEIGHT)]
+ROOMS = {"ample": (1 << 16, 8), "for one": (1, 0), "for some": (700, 0)}
+
+
+@pytest.mark.parametrize("interval", [1, 5, 50])
+def test_results_do_not_depend_on_the_room_for_pairs(
+    monkeypatch: pytest.MonkeyPatch, interval: int
+) -> None:
+    """Steps with more pairs than their arrays hold change nothing and are made again, with those
+    that were started after them: the same bits of parameters, moments, statistics and results."""
+    need_gpu()
+    from pipeline.render.gpu import resident
+
+    found, dispatches = {}, {}
+    for name, (least, of_gaussian) in ROOMS.items():
+        monkeypatch.setattr(resident, "MIN_CAPACITY", least)
+        monkeypatch.setattr(resident, "PAIRS_PER_GAUSSIAN", of_gaussian)
+        training, state, results = make_backend("gpu").resident(), State((0.7, -1.2)), []
+        assert isinstance(training, resident.GpuTraining)
+        training.gpu.counts = Counts()
+        training.load(state.optimised)
+        for number in range(1, 8):
+            view = VIEWS[number // 3]
+            size = view.height, view.width
+            step = replace(
+                STEP,
+                camera=view,
+                image=replace(IMAGE, key=size, target=pixels(*size, 3, seed=number // 3)),
+                embedding=(0.7, -1.2),
+                camera_gradients=number % 2 == 0,
+                losses=constant_losses if number == 5 else None,
+                adam=state.adam.rates(adam_step(number)),
+            )
+            training.step(step)
+            if number % interval == 0:
+                results += training.results()
+        training.store(state.optimised)
+        results += training.results()
+        assert len(results) == 7
+        found[name] = results, state.tensors()
+        dispatches[name] = training.gpu.counts.dispatches
+    assert dispatches["for one"] > dispatches["ample"] < dispatches["for some"], "steps repeated"
+    results, tensors = found.pop("ample")
+    for name, (other, changed) in found.items():
+        for one, two in zip(results, other, strict=True):
+            assert replace(one, camera=None) == replace(two, camera=None), name
+            if one.camera is not None:
+                for part, value in vars(one.camera).items():
+                    assert torch.equal(value, getattr(two.camera, part)), f"{name}: {part}"
+        for key, tensor in tensors.items():
+            assert torch.equal(tensor, changed[key]), f"{name}: {key}"
 
 
 def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from pipeline.config.settled import TrainOptions
+from pipeline.render.gpu import resident
 from pipeline.scene.views import View
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
@@ -119,9 +120,17 @@ def test_two_runs_give_the_same_bits(scene: TinyScene, tmp_path: Path, strategy:
 
 
 @pytest.mark.parametrize("step", [2, 13, 22, 41])
-def test_a_killed_run_resumes_to_the_same_bits(scene: TinyScene, tmp_path: Path, step: int) -> None:
+def test_a_killed_run_resumes_to_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """Also if the arrays of pairs are too small again and again in the killed run, and if its
+    results are read at other steps."""
+    # Otherwise so short a run would record its curve, and read the results, after each step.
+    monkeypatch.setattr(session, "CURVE_RECORDS", 4)
     config = options("gpu", background="random", coarse_share=0.4)
     whole = run(scene, tmp_path / "whole", config, alpha=True)
+    monkeypatch.setattr(resident, "MIN_CAPACITY", 1)
+    monkeypatch.setattr(resident, "PAIRS_PER_GAUSSIAN", 0)
     with killed_in(step):
         run(scene, tmp_path / "cut", config, alpha=True)
     assert_same(whole, run(scene, tmp_path / "cut", config, alpha=True))

@@ -14,13 +14,15 @@ from pipeline.render import checks
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.gpu import adam, layout, rasterise
-from pipeline.render.gpu.device import Gpu
+from pipeline.render.gpu.device import Buffer, Gpu
 from pipeline.render.gpu.loss import LossImage, compose, l1_ssim, upload_layers
+from pipeline.render.gpu.primitives import sum_rows
 from pipeline.render.gpu.resident import GpuTraining
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import (
     AdamRates,
     AlphaChangeLoss,
+    CameraGradients,
     Forward,
     FrameMoments,
     Gradients,
@@ -54,6 +56,7 @@ class Binned:
 
     projected: Projected
     lists: rasterise.Lists
+    totals: rasterise.Totals
 
 
 @dataclass(frozen=True)
@@ -114,17 +117,21 @@ class GpuBackend(Backend[Projected, Binned]):
         return replace(projected, options=options, projection=projection, radii=radii)
 
     def bin(self, projected: Projected) -> Binned:
-        lists = rasterise.list_pairs(Workspace(self.gpu), projected.projection)
-        return Binned(projected, lists)
+        gpu, projection = self.gpu, projected.projection
+        size = 4 * projection.scene.count
+        visible = gpu.empty(size)  # ``list_pairs`` overwrites it.
+        gpu.copy(projection.visible, 0, visible, 0, size)
+        lists, totals = rasterise.list_pairs(Workspace(gpu), replace(projection, visible=visible))
+        return Binned(projected, lists, totals)
 
     def blend(self, binned: Binned) -> Forward:
-        gpu, lists, projected = self.gpu, binned.lists, binned.projected
-        image = rasterise.blend(Workspace(gpu), lists)
+        gpu, totals, projected = self.gpu, binned.totals, binned.projected
+        image = rasterise.blend(Workspace(gpu), binned.lists)
         alpha = image.plane(gpu, 0)
         color = torch.from_numpy(gpu.read(image.color, np.float32, 3 * alpha.numel()))
         return Forward(
-            color.view(*alpha.shape, 3), alpha, projected.radii, lists.num_visible,
-            lists.num_dropped, lists.length, lambda: (image.plane(gpu, 1), image.plane(gpu, 2)),
+            color.view(*alpha.shape, 3), alpha, projected.radii, totals.visible,
+            totals.dropped, totals.pairs, lambda: (image.plane(gpu, 1), image.plane(gpu, 2)),
             State(projected.sh, image),
         )  # fmt: skip
 
@@ -177,7 +184,7 @@ class GpuBackend(Backend[Projected, Binned]):
         return Gradients(
             found["means"], found["log_scales"], found["quats"], found["opacity_logits"][:, 0],
             d_sh, found["means2d"], found["colors"] if colors else None,
-            rasterise.camera_gradients(space, more["d_camera"], count) if camera else None,
+            _camera_gradients(space, more["d_camera"], count) if camera else None,
         )  # fmt: skip
 
     def l1_ssim(
@@ -195,7 +202,7 @@ class GpuBackend(Backend[Projected, Binned]):
         found = l1_ssim(
             space, gpu.upload(rendered.numpy()), image, (width, height), ssim_weight, l2_weight
         )
-        error, ssim, _ = found.values(space)
+        error, ssim, _ = found.means(sum_rows(space, found.sums, found.rows, 4))
         loss = (1 - ssim_weight) * error + ssim_weight * (1 - ssim)
         grad = torch.from_numpy(gpu.read(found.gradient, np.float32, rendered.numel()))
         return LossResult(loss, error, ssim, grad.view(rendered.shape))
@@ -302,3 +309,7 @@ class GpuBackend(Backend[Projected, Binned]):
         layout.fetch(gpu, result, images[0])
         layout.fetch(gpu, d_alpha, images[1])
         return images
+
+
+def _camera_gradients(space: Workspace, rows: Buffer, count: int) -> CameraGradients:
+    return rasterise.camera_gradients(sum_rows(space, rows, count, layout.CAMERA_PARAMETERS))

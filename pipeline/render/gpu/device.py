@@ -14,7 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.render.gpu.kernels import source
+from pipeline.render.gpu.counts import Counts
+from pipeline.render.gpu.kernels import Binding, source
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import install_extra
 
@@ -90,10 +91,26 @@ class KernelTimer(Protocol):
         """Return the queries of the pass of the next kernel."""
 
 
+@dataclass(frozen=True)
+class BindGroup:
+    """The buffers of a kernel.
+
+    Attributes:
+        group: The ``wgpu.GPUBindGroup``.
+        buffers: The buffers with their bindings, without placeholders.
+    """
+
+    group: Any
+    buffers: tuple[tuple[Binding, Buffer], ...]
+
+
 class Gpu:
     """An open device.
 
     Kernels are named as their WGSL files; ``name.entry`` is another entry point than ``main``.
+
+    Attributes:
+        counts: The work since the device was opened, or since a caller replaced the counts.
 
     Raises:
         UserError: there is no such device, or it lacks what the kernels need.
@@ -125,6 +142,7 @@ class Gpu:
         self._encoder: Any = None
         self._pass: Any = None
         self.submissions = 0  # The number of submitted command buffers.
+        self.counts = Counts()
         self.timer: KernelTimer | None = None
 
     # ---- Buffers ----
@@ -143,7 +161,9 @@ class Gpu:
         usage = wgpu.BufferUsage
         try:
             return self.device.create_buffer(
-                size=size, usage=usage.STORAGE | usage.UNIFORM | usage.COPY_SRC | usage.COPY_DST
+                label=what,
+                size=size,
+                usage=usage.STORAGE | usage.UNIFORM | usage.COPY_SRC | usage.COPY_DST,
             )
         except (wgpu.GPUOutOfMemoryError, wgpu.GPUValidationError) as error:
             raise UserError(
@@ -178,11 +198,13 @@ class Gpu:
         if data.nbytes % 4:
             data = np.concatenate([data, np.zeros(-data.nbytes % 4, np.uint8)])
         if data.nbytes:
+            self.counts.uploaded += data.nbytes
             self.device.queue.write_buffer(buffer, offset, data)
 
     def copy(self, source: Buffer, start: int, target: Buffer, offset: int, size: int) -> None:
         """Record a copy of ``size`` bytes, from ``start`` on, to ``offset`` of another buffer."""
         self._end_pass()
+        self.counts.add_copy(source, target, size)
         self._encode().copy_buffer_to_buffer(source, start, target, offset, size)
 
     def read(self, buffer: Buffer, dtype: Any, count: int, offset: int = 0) -> NDArray[Any]:
@@ -195,6 +217,8 @@ class Gpu:
         size = count * np.dtype(dtype).itemsize
         if not size:
             return np.zeros(0, dtype)
+        self.counts.waits += 1
+        self.counts.downloaded += size
         try:
             data = self.device.queue.read_buffer(buffer, offset, (size + 3) // 4 * 4)
         except Exception as error:
@@ -217,7 +241,7 @@ class Gpu:
         """
         self.dispatch(kernel, groups, self.bind(kernel, buffers))
 
-    def bind(self, kernel: str, buffers: Mapping[str, Buffer]) -> Any:
+    def bind(self, kernel: str, buffers: Mapping[str, Buffer]) -> BindGroup:
         """The bind group of a kernel's buffers, by the names of its bindings."""
         _, layout = self._pipeline(kernel)
         bindings = source(kernel.partition(".")[0]).bindings
@@ -228,9 +252,10 @@ class Gpu:
             buffer = buffers.get(binding.name) or self._placeholder(binding.number)
             resource = {"buffer": buffer, "offset": 0, "size": buffer.size}
             entries.append({"binding": binding.number, "resource": resource})
-        return self.device.create_bind_group(layout=layout, entries=entries)
+        group = self.device.create_bind_group(layout=layout, entries=entries)
+        return BindGroup(group, tuple((b, buffers[b.name]) for b in bindings if b.name in buffers))
 
-    def dispatch(self, kernel: str, groups: int | tuple[int, int, int], bound: Any) -> None:
+    def dispatch(self, kernel: str, groups: int | tuple[int, int, int], bound: BindGroup) -> None:
         """Record a kernel with the result of ``bind``."""
         if groups == 0:
             return
@@ -244,12 +269,14 @@ class Gpu:
         elif self._pass is None:
             self._pass = self._encode().begin_compute_pass()
         self._pass.set_pipeline(self._pipeline(kernel)[0])
-        self._pass.set_bind_group(0, bound)
+        self._pass.set_bind_group(0, bound.group)
         self._pass.dispatch_workgroups(*groups)
+        self.counts.add_dispatch(bound.buffers)
 
     def clear(self, buffer: Buffer) -> None:
         """Fill a buffer with zeros."""
         self._end_pass()
+        self.counts.add_copy(None, buffer, buffer.size)
         self._encode().clear_buffer(buffer)
 
     def submit(self) -> None:
@@ -258,6 +285,7 @@ class Gpu:
         encoder, self._encoder = self._encoder, None
         if encoder is not None:
             self.submissions += 1
+            self.counts.submissions += 1
             self.device.queue.submit([encoder.finish()])
 
     def _encode(self) -> Any:

@@ -21,7 +21,7 @@ SHARED = (
 
 _BINDING = re.compile(
     r"@group\(0\) @binding\((?P<number>\d+)\) var<(?P<kind>uniform|storage)"
-    r"(?:, (?P<access>read|read_write))?> (?P<name>\w+):"
+    r"(?:, (?P<access>read_write|read))?> (?P<name>\w+):"
 )
 _CONSTANT = re.compile(r"constexpr (?P<type>double|float|int) (?P<name>k\w+) = (?P<value>[^;]+);")
 _IMPORT = re.compile(r"^#import (\w+)$", re.MULTILINE)
@@ -29,11 +29,17 @@ _IMPORT = re.compile(r"^#import (\w+)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Binding:
-    """One buffer of a kernel. ``kind``: ``uniform``, ``read`` or ``read_write``."""
+    """One buffer of a kernel.
+
+    Attributes:
+        kind: ``uniform``, ``read`` or ``read_write``.
+        only_written: Whether the kind is ``read_write`` but no kernel of the module reads it.
+    """
 
     number: int
     name: str
     kind: str
+    only_written: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,22 @@ def source(name: str) -> Source:
     """The module ``wgsl/name.wgsl`` with its imports and the constants."""
     text = constants() + _with_imports((FOLDER / f"{name}.wgsl").read_text("utf-8"), {name})
     bindings = tuple(
-        Binding(int(m["number"]), m["name"], "uniform" if m["kind"] == "uniform" else m["access"])
+        Binding(
+            int(m["number"]),
+            m["name"],
+            m["access"] or "uniform",
+            m["access"] == "read_write" and _is_only_assigned(m["name"], text),
+        )
         for m in _BINDING.finditer(text)
     )
     return Source(text, bindings)
+
+
+def _is_only_assigned(name: str, text: str) -> bool:
+    """Return True if each use of a variable, apart from its declaration, is an assignment."""
+    code = re.sub(r"//.*", "", text)
+    assigned = re.findall(rf"(?m)(?:^|\{{)\s*{name}(?:\[[^=;]*\])?(?:\.\w+)? = ", code)
+    return len(re.findall(rf"\b{name}\b", code)) == len(assigned) + 1
 
 
 @cache

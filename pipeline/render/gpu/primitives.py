@@ -58,9 +58,26 @@ def sort(
 
 
 def sum_rows(space: Workspace, rows: Buffer, count: int, width: int) -> NDArray[np.float64]:
-    """The sum of ``count`` rows of ``width`` float32."""
-    gpu, groups = space.gpu, blocks(count, BLOCK)
-    sums = space.get(f"sums of rows of {width}", 4 * width * groups)
-    space.run("sum_rows", groups, size=gpu.uniform("II", count, width), values=rows, sums=sums)
-    found = gpu.read(sums, np.float32, width * groups).reshape(-1, width)
-    return found.sum(0, dtype=np.float64)
+    """The sum of ``count`` rows of ``width`` float32; waits for it."""
+    size = partial_sums(count, width)
+    sums = space.get(f"sums of rows of {width}", 4 * size)
+    sum_blocks(space, rows, count, width, sums)
+    return add_partial_sums(space.gpu.read(sums, np.float32, size), width)
+
+
+def partial_sums(count: int, width: int) -> int:
+    """The number of float32 that ``sum_blocks`` writes."""
+    return width * blocks(count, BLOCK)
+
+
+def sum_blocks(
+    space: Workspace, rows: Buffer, count: int, width: int, sums: Buffer, at: int = 0
+) -> None:
+    """Write the sums of blocks of ``BLOCK`` rows of ``width`` float32, from element ``at`` on."""
+    size = space.gpu.uniform("III", count, width, at)
+    space.run("sum_rows", blocks(count, BLOCK), size=size, values=rows, sums=sums)
+
+
+def add_partial_sums(sums: NDArray[np.float32], width: int) -> NDArray[np.float64]:
+    """The sum of all rows, from the sums of blocks."""
+    return sums.reshape(-1, width).sum(0, dtype=np.float64)

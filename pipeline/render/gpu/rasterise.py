@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.adam import uniform
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
-from pipeline.render.gpu.primitives import scan, sort, sum_rows
+from pipeline.render.gpu.primitives import scan, sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AdamRates, CameraGradients
 from pipeline.runtime.errors import UserError
@@ -19,6 +21,7 @@ from pipeline.runtime.errors import UserError
 # Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
 MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
 DEPTH_BITS = 32
+TOTALS = 4  # The words of ``Totals``.
 NO_RATES = AdamRates((0.0, 0.0), 1)
 # The tiles of one dispatch: an image of 1024 x 1024 pixels.
 TILES_OF_BAND = 4096
@@ -51,8 +54,8 @@ class Projection:
         records, boxes: ``Record`` and ``Box`` of the visible Gaussians.
         radii: See ``Forward.radii``.
         tile_counts: The number of tiles of each Gaussian.
-        visible: 1 for visible Gaussians, 0 for others.
-        dropped: See ``Forward.num_dropped``.
+        visible: 1 for visible Gaussians, 0 for others, until ``sort_visible``.
+        dropped: One uint32, the sum of ``Forward.num_dropped`` since the buffer was made.
     """
 
     scene: Scene
@@ -67,12 +70,61 @@ class Projection:
 
 
 @dataclass(frozen=True)
+class Visible:
+    """The visible Gaussians, front to back, and the ranges of their pairs.
+
+    Attributes:
+        gaussians: The Gaussians.
+        count: One uint32, the number of visible Gaussians.
+        first: (N + 1,), the first pair of each rank; from the number of visible Gaussians on, the
+            number of all pairs.
+        ranges: See ``Lists``; empty.
+    """
+
+    projection: Projection
+    gaussians: Buffer
+    count: Buffer
+    first: Buffer
+    ranges: Buffer
+
+
+@dataclass(frozen=True)
+class Totals:
+    """The numbers of a step, as admit.wgsl writes them.
+
+    Attributes:
+        stopped: Whether the step was not made.
+        pairs: The number of (Gaussian, tile) pairs.
+        visible: See ``Forward.num_visible``.
+        dropped: The sum of ``Forward.num_dropped`` since the projection's buffers were made.
+    """
+
+    stopped: bool
+    pairs: int
+    visible: int
+    dropped: int
+
+    @staticmethod
+    def of(words: NDArray[np.uint32]) -> Totals:
+        stopped, pairs, visible, dropped = map(int, words)
+        return Totals(stopped != 0, pairs, visible, dropped)
+
+    def require_listable(self) -> None:
+        """Raise a UserError if there are too many pairs for any arrays."""
+        if self.pairs > MAX_INTERSECTIONS:
+            raise UserError(
+                f"{self.visible} Gaussians overlap more than {MAX_INTERSECTIONS} tiles of 16 x 16 "
+                "pixels in one view",
+                fix="render smaller images, or remove Gaussians that are far too large",
+            )
+
+
+@dataclass(frozen=True)
 class Lists:
     """The (Gaussian, tile) pairs. Pairs are numbered by depth of their Gaussian.
 
     Attributes:
-        num_visible, num_dropped: See ``Forward``.
-        length: The number of pairs.
+        capacity: The number of pairs that the arrays hold.
         gaussian_of: The Gaussian of each pair.
         pairs: The pairs, by tile and front to back.
         ranges: The range of each tile in ``pairs``.
@@ -80,9 +132,7 @@ class Lists:
     """
 
     projection: Projection
-    num_visible: int
-    num_dropped: int
-    length: int
+    capacity: int
     gaussian_of: Buffer
     pairs: Buffer
     ranges: Buffer
@@ -134,56 +184,96 @@ def project(space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int])
         "visible": space.get("visible", 4 * count),
         "dropped": space.get("dropped", 4),
     }
-    space.gpu.clear(arrays["dropped"])
     space.run("project", blocks(count), view=view, geometry=scene.geometry, sh=scene.sh, **arrays)
     return Projection(scene, view, size, **arrays)
 
 
-def list_pairs(space: Workspace, projection: Projection) -> Lists:
-    """List the Gaussians that overlap each tile, front to back.
-
-    Raises:
-        UserError: There are too many pairs.
-    """
+def sort_visible(space: Workspace, projection: Projection) -> Visible:
+    """Sort the visible Gaussians by depth and count their pairs. Overwrites
+    ``projection.visible``."""
     gpu, p, count = space.gpu, projection, projection.scene.count
-    tiles_x, tiles_y = layout.tiles_of(*p.size)
-    tiles = tiles_x * tiles_y
+    scan(space, p.visible, count)
+    depths, gaussians = space.get("depths", 4 * count), space.get("visible Gaussians", 4 * count)
+    num_visible = space.get("number of visible Gaussians", 4)
+    space.run(
+        "compact",
+        blocks(count),
+        size=gpu.uniform("I", count),
+        records=p.records,
+        radii=p.radii,
+        places=p.visible,
+        depths=depths,
+        gaussians=gaussians,
+        length=num_visible,
+    )
+    _, ordered = sort(space, depths, gaussians, num_visible, capacity=count, bits=DEPTH_BITS)
+    tiles = math.prod(layout.tiles_of(*p.size))
     ranges = space.get("tile ranges", 8 * tiles)
-    gpu.clear(ranges)
-    slots = space.get("slots of Gaussians", 4 * count)
-    ordered, num_visible = _visible_by_depth(space, p)
     # One more than the Gaussians: the last prefix sum is the number of pairs.
     first = space.get("first pairs", 4 * (count + 1))
     space.run(
         "order",
-        blocks(count + 1),
-        size=gpu.uniform("I", count + 1),
+        blocks(max(count + 1, tiles)),
+        size=gpu.uniform("II", count + 1, tiles),
         length=num_visible,
         gaussians=ordered,
         tile_counts=p.tile_counts,
         ordered=first,
+        ranges=ranges,
     )
     scan(space, first, count + 1)
-    totals = space.get("totals", 12)
-    gpu.copy(num_visible, 0, totals, 0, 4)
-    gpu.copy(p.dropped, 0, totals, 4, 4)
-    gpu.copy(first, 4 * count, totals, 8, 4)
-    seen, dropped, length = map(int, gpu.read(totals, np.uint32, 3))
-    if length > MAX_INTERSECTIONS:
-        raise UserError(
-            f"{seen} Gaussians overlap more than {MAX_INTERSECTIONS} tiles of 16 x 16 pixels in "
-            "one view",
-            fix="render smaller images, or remove Gaussians that are far too large",
-        )
-    tile_of, numbers = space.get("tiles of pairs", 4 * length), space.get("pairs", 4 * length)
-    gaussian_of = space.get("Gaussians of pairs", 4 * length)
+    return Visible(p, ordered, num_visible, first, ranges)
+
+
+def admit(
+    space: Workspace, visible: Visible, capacity: int, stopped: Buffer, results: Buffer, at: int = 0
+) -> Buffer:
+    """Decide on the device whether a step of these Gaussians is made (admit.wgsl).
+
+    Args:
+        capacity: The number of pairs that the arrays of the step hold.
+        stopped: One uint32; not zero if a step before was not made.
+        results: The buffer for ``Totals``, at its word ``at``.
+
+    Returns:
+        One uint32, the number of pairs to list: none if the step is not made.
+    """
+    length = space.get("number of pairs", 4)
+    count = visible.projection.scene.count
+    space.run(
+        "admit",
+        1,
+        size=space.gpu.uniform("III", count, capacity, at),
+        num_visible=visible.count,
+        first=visible.first,
+        dropped=visible.projection.dropped,
+        stopped=stopped,
+        length=length,
+        results=results,
+    )
+    return length
+
+
+def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int) -> Lists:
+    """List the pairs.
+
+    Args:
+        length: The result of ``admit``.
+        capacity: At least the number of pairs.
+    """
+    p, gpu = visible.projection, space.gpu
+    count, (tiles_x, tiles_y) = p.scene.count, layout.tiles_of(*p.size)
+    tiles = tiles_x * tiles_y
+    tile_of, numbers = space.get("tiles of pairs", 4 * capacity), space.get("pairs", 4 * capacity)
+    gaussian_of = space.get("Gaussians of pairs", 4 * capacity)
+    slots = space.get("slots of Gaussians", 4 * count)
     space.run(
         "pairs",
-        blocks(seen),
-        size=space.uniform("sizes of pairs", "IIII", count, tiles, tiles_x, length),
-        length=num_visible,
-        gaussians=ordered,
-        first=first,
+        blocks(count),
+        size=gpu.uniform("IIII", count, tiles, tiles_x, capacity),
+        length=visible.count,
+        gaussians=visible.gaussians,
+        first=visible.first,
         tile_counts=p.tile_counts,
         records=p.records,
         boxes=p.boxes,
@@ -192,38 +282,28 @@ def list_pairs(space: Workspace, projection: Projection) -> Lists:
         gaussian_of=gaussian_of,
         slots=slots,
     )
-    if length:
-        tile_of, numbers = sort(
-            space, tile_of, numbers, space.uniform("length", "I", length), capacity=length,
-            bits=tiles.bit_length(),
-        )  # fmt: skip
-        sizes = space.uniform("sizes of ranges", "II", length, tiles)
-        space.run("ranges", blocks(length), size=sizes, tile_of=tile_of, ranges=ranges)
-    return Lists(p, seen, dropped, length, gaussian_of, numbers, ranges, slots)
-
-
-def _visible_by_depth(space: Workspace, projection: Projection) -> tuple[Buffer, Buffer]:
-    """The visible Gaussians front to back, and their number."""
-    gpu, count = space.gpu, projection.scene.count
-    places = space.get("places of visible Gaussians", 4 * count)
-    gpu.copy(projection.visible, 0, places, 0, 4 * count)
-    scan(space, places, count)
-    depths, visible = space.get("depths", 4 * count), space.get("visible Gaussians", 4 * count)
-    num_visible = space.get("number of visible Gaussians", 4)
-    gpu.clear(num_visible)
-    space.run(
-        "compact",
-        blocks(count),
-        size=gpu.uniform("I", count),
-        records=projection.records,
-        radii=projection.radii,
-        places=places,
-        depths=depths,
-        gaussians=visible,
-        length=num_visible,
+    tile_of, numbers = sort(
+        space, tile_of, numbers, length, capacity=capacity, bits=tiles.bit_length()
     )
-    _, ordered = sort(space, depths, visible, num_visible, capacity=count, bits=DEPTH_BITS)
-    return ordered, num_visible
+    size = gpu.uniform("I", tiles)
+    arrays = {"tile_of": tile_of, "ranges": visible.ranges}
+    space.run("ranges", blocks(capacity), size=size, length=length, **arrays)
+    return Lists(p, capacity, gaussian_of, numbers, visible.ranges, slots)
+
+
+def list_pairs(space: Workspace, projection: Projection) -> tuple[Lists, Totals]:
+    """List the Gaussians that overlap each tile, front to back, in arrays of the needed size; waits
+    for their number. Overwrites ``projection.visible``.
+
+    Raises:
+        UserError: There are too many pairs.
+    """
+    visible = sort_visible(space, projection)
+    stopped, results = space.get("stopped", 4), space.get("totals", 4 * TOTALS)
+    length = admit(space, visible, (1 << 32) - 1, stopped, results)
+    totals = Totals.of(space.gpu.read(results, np.uint32, TOTALS))
+    totals.require_listable()
+    return fill_lists(space, visible, length, totals.pairs), totals
 
 
 def blend(space: Workspace, lists: Lists) -> Image:
@@ -252,11 +332,12 @@ def backward(
     Args:
         rates: The rates of ``ShAdam``, which updates the SH coefficients; None: it does not.
         more: ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH coefficients that are updated, or
-            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients.
+            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients; ``stopped``
+            as of ``admit``.
     """
     lists, projection = image.lists, image.lists.projection
     scene = projection.scene
-    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.length)
+    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.capacity)
     _run_in_bands(
         space, "blend_backward", lists, color=image.color, planes=image.planes, ends=image.ends,
         d_color=d_color, d_planes=d_planes, slots=slots,
@@ -280,10 +361,9 @@ def backward(
     return gradients
 
 
-def camera_gradients(space: Workspace, rows: Buffer, count: int) -> CameraGradients:
-    """The sum of the Gaussians' parts (N, ``CAMERA_PARAMETERS``)."""
-    total = torch.from_numpy(sum_rows(space, rows, count, layout.CAMERA_PARAMETERS))
-    return CameraGradients(*total.split([3, 3, 2, 2]))
+def camera_gradients(total: NDArray[np.float64]) -> CameraGradients:
+    """The gradients of the camera, from the sum of the Gaussians' parts (``CAMERA_PARAMETERS``)."""
+    return CameraGradients(*torch.from_numpy(total).split([3, 3, 2, 2]))
 
 
 def _run_in_bands(space: Workspace, kernel: str, lists: Lists, **buffers: Buffer) -> None:

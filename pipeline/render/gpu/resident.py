@@ -1,20 +1,29 @@
-"""Training on the device: only the number of pairs and the loss are read back in a step."""
+"""Training on the device. The processor records steps without waiting for them, and reads the
+results of many at once.
+
+The arrays of pairs have room for a number of pairs that the steps before suggest. A step with more
+pairs changes nothing, nor do the steps after it (admit.wgsl); when the processor reads this, it
+makes the arrays larger and records these steps again. So results do not depend on the room.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_step, frame_adam
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, upload_layers
-from pipeline.render.gpu.memory import memory_line
-from pipeline.render.gpu.primitives import sum_rows
+from pipeline.render.gpu.memory import PAIRS_PER_GAUSSIAN, memory_line
+from pipeline.render.gpu.primitives import add_partial_sums, partial_sums, sum_blocks
+from pipeline.render.gpu.rasterise import Totals
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
     Optimised,
@@ -28,6 +37,11 @@ from pipeline.render.types import AdamRates
 
 # The bytes of the training images that are kept on the device. Others are copied at every use.
 IMAGE_CACHE = 2 << 30
+# The steps whose results are read at once at the latest, and the words of their results at least.
+MAX_RECORDED, RESULT_WORDS = 32, 1 << 16
+# The pairs for which there is room at least. The room of the next steps is ``ROOM`` times the
+# largest number of pairs if a step had less than ``LEAST_ROOM``.
+MIN_CAPACITY, LEAST_ROOM, ROOM = 1 << 16, 1.1, 1.3
 
 
 @dataclass(frozen=True)
@@ -70,6 +84,23 @@ class _Images:
 
 
 @dataclass(frozen=True)
+class _Recorded:
+    """A step whose result has not been read.
+
+    Attributes:
+        loss: The loss on the device.
+        at: The first word of each part of the result in the buffer of results: the totals, then
+            sums of blocks of rows of the loss, of the camera and of the embedding.
+        end: The word after the last.
+    """
+
+    step: ResidentStep
+    loss: LossSums
+    at: Mapping[str, int]
+    end: int
+
+
+@dataclass(frozen=True)
 class _Planes:
     """See ``resident.Planes``: copied to the CPU when they are read."""
 
@@ -93,23 +124,31 @@ class GpuTraining(ResidentTraining):
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.buffers: dict[str, Buffer] = {}
         self.embedding_size = 0
+        self.stopped = gpu.empty(4, what="stopped")
+        self._recorded: list[_Recorded] = []
+        self._results: list[StepResult] = []
+        self._dropped = 0  # The sum of the steps whose results have been read.
+        self._capacity = 0  # The pairs for which the arrays of a step have room.
 
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
 
     def load(self, optimised: Optimised) -> None:
+        self._read_results()
         parameters, count = optimised.parameters, len(optimised.last)
         sh, geometry = parameters["sh"], layout.join(layout.GEOMETRY, parameters)
         self.scene = rasterise.Scene(
             count, sh.shape[1], self._fill("geometry", geometry), self._fill("sh", sh.numpy())
         )
         appearance = parameters.get("appearance")
+        self._capacity = max(self._capacity, MIN_CAPACITY, PAIRS_PER_GAUSSIAN * count)
         self.embedding_size = 0 if appearance is None else appearance.shape[1]
         self.buffers = {
             name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
         }
 
     def store(self, optimised: Optimised) -> None:
+        self._read_results()
         parameters, scene = optimised.parameters, self.scene
         found = layout.split(layout.GEOMETRY, scene.geometry, self.gpu, scene.count)
         for name, tensor in found.items():
@@ -118,7 +157,20 @@ class GpuTraining(ResidentTraining):
         for name, tensor in _others(optimised).items():
             layout.fetch(self.gpu, self.buffers[name], tensor)
 
-    def step(self, step: ResidentStep) -> StepResult:
+    def step(self, step: ResidentStep) -> None:
+        if self._recorded:
+            end = self._recorded[-1].end + sum(self._sizes(step).values())
+            if end > RESULT_WORDS or len(self._recorded) == MAX_RECORDED:
+                self._read_results()
+        self._record(step)
+
+    def results(self) -> list[StepResult]:
+        self._read_results()
+        found, self._results = self._results, []
+        return found
+
+    def _record(self, step: ResidentStep) -> None:
+        """Record and start the kernels of a step."""
         gpu, space, scene, camera = self.gpu, self.space, self.scene, step.camera
         size = camera.width, camera.height
         packed = layout.pack_view(camera, step.options, scene.count, scene.coefficients)
@@ -127,35 +179,97 @@ class GpuTraining(ResidentTraining):
         if appearance is not None:
             space.run("appearance.show", blocks(scene.count), **appearance)
         projection = rasterise.project(space, scene, view, size)
-        lists = rasterise.list_pairs(space, projection)
+        visible = rasterise.sort_visible(space, projection)
+        end, at = self._recorded[-1].end if self._recorded else 0, {}
+        for name, words in self._sizes(step).items():
+            at[name] = end
+            end += words
+        results = space.get("results", 4 * max(RESULT_WORDS, end))
+        length = rasterise.admit(
+            space, visible, self._capacity, self.stopped, results, at["totals"]
+        )
+        lists = rasterise.fill_lists(space, visible, length, self._capacity)
         image = rasterise.blend(space, lists)
         target = self.images.get(step.image)
-        d_planes = space.get("gradients of alpha and depth", 8 * size[0] * size[1])
-        gpu.clear(d_planes)
-        d_color, loss = self._loss(step, target, image, d_planes)
-        self._add_other_losses(step, image, d_planes)
-        more = self._moments("sh") | {"last_step": self.buffers["last"]}
+        d_color, d_planes, loss = self._loss(step, target, image)
+        sum_blocks(space, loss.sums, loss.rows, 4, results, at["loss"])
+        d_planes = self._with_other_losses(step, image, d_planes)
+        more = self._moments("sh") | {"last_step": self.buffers["last"], "stopped": self.stopped}
         if step.camera_gradients:
-            size_of_rows = 4 * layout.CAMERA_PARAMETERS * scene.count
-            more["d_camera"] = space.get("camera gradients", size_of_rows)
+            width = layout.CAMERA_PARAMETERS
+            more["d_camera"] = space.get("camera gradients", 4 * width * scene.count)
         rates = step.adam["sh"]
         gradients = rasterise.backward(space, image, d_color, d_planes, rates, **more)
+        if step.camera_gradients:
+            sum_blocks(space, more["d_camera"], scene.count, width, results, at["camera"])
         if appearance is not None:
             space.run("appearance.hide", blocks(scene.count), **appearance)
             space.run("appearance.gradient", blocks(scene.count), **appearance)
+            rows = appearance["d_weights"]
+            sum_blocks(space, rows, scene.count, self.embedding_size, results, at["embedding"])
         self._observe(step, projection, gradients)
         self._optimise(step.adam, gradients)
-        error, ssim, squared = loss.values(space)
-        cameras = None
+        gpu.submit()
+        self._recorded.append(_Recorded(step, loss, at, end))
+
+    def _sizes(self, step: ResidentStep) -> dict[str, int]:
+        """The words of each part of a step's result, see ``_Recorded``."""
+        count = self.scene.count
+        tiles = math.prod(layout.tiles_of(step.camera.width, step.camera.height))
+        return {
+            "totals": rasterise.TOTALS,
+            "loss": partial_sums(3 * tiles, 4),
+            "camera": step.camera_gradients * partial_sums(count, layout.CAMERA_PARAMETERS),
+            "embedding": partial_sums(count, len(step.embedding or ())),
+        }
+
+    def _read_results(self) -> None:
+        """Wait for the recorded steps. Those that had too many pairs are made again."""
+        while self._recorded:
+            recorded, self._recorded = self._recorded, []
+            end = recorded[-1].end
+            results = self.space.get("results", 4 * end)
+            words = self.gpu.read(results, np.uint32, end)
+            totals = [Totals.of(words[r.at["totals"] :][: rasterise.TOTALS]) for r in recorded]
+            for of_step, found in zip(recorded, totals, strict=True):
+                dropped = (found.dropped - self._dropped) % (1 << 32)
+                self._dropped = found.dropped
+                if not found.stopped:
+                    self._results.append(self._result(of_step, found, dropped, words))
+            self._make_room(max(totals, key=lambda each: each.pairs))
+            stopped = [each for each in totals if each.stopped]
+            if stopped:
+                self.gpu.clear(self.stopped)
+                for again in recorded[-len(stopped) :]:
+                    self._record(again.step)
+
+    def _make_room(self, largest: Totals) -> None:
+        """Give the next steps room for more pairs if a step has used most of it."""
+        if LEAST_ROOM * largest.pairs > self._capacity:
+            largest.require_listable()
+            limit = min(rasterise.MAX_INTERSECTIONS, self.gpu.max_bytes // layout.SLOT_BYTES)
+            self._capacity = max(largest.pairs, min(limit, int(ROOM * largest.pairs)))
+
+    def _result(
+        self, recorded: _Recorded, totals: Totals, dropped: int, words: NDArray[np.uint32]
+    ) -> StepResult:
+        step, numbers, at = recorded.step, words.view(np.float32), recorded.at
+        total = add_partial_sums(numbers[at["loss"] : at["camera"]], 4)
+        error, ssim, squared = recorded.loss.means(total)
+        cameras, embedding = None, None
         if step.camera_gradients:
-            cameras = rasterise.camera_gradients(space, more["d_camera"], scene.count)
+            rows = numbers[at["camera"] : at["embedding"]]
+            cameras = rasterise.camera_gradients(add_partial_sums(rows, layout.CAMERA_PARAMETERS))
+        if step.embedding is not None:
+            rows = numbers[at["embedding"] : recorded.end]
+            embedding = tuple(add_partial_sums(rows, len(step.embedding)).tolist())
         return StepResult(
             loss=(1 - step.ssim_weight) * error + step.ssim_weight * (1 - ssim),
             squared_error=squared,
-            num_visible=lists.num_visible,
-            num_dropped=lists.num_dropped,
+            num_visible=totals.visible,
+            num_dropped=dropped,
             camera=cameras,
-            embedding=self._embedding_gradient(step),
+            embedding=embedding,
         )
 
     def _fill(self, name: str, array: np.ndarray) -> Buffer:
@@ -164,16 +278,16 @@ class GpuTraining(ResidentTraining):
         return buffer
 
     def _loss(
-        self, step: ResidentStep, target: _Image, image: rasterise.Image, d_planes: Buffer
-    ) -> tuple[Buffer, LossSums]:
-        """The gradient on the colours, and the loss; with surroundings, the gradient on alpha as
-        well, in ``d_planes``."""
+        self, step: ResidentStep, target: _Image, image: rasterise.Image
+    ) -> tuple[Buffer, Buffer, LossSums]:
+        """The gradients on the colours and on alpha and depth, and the loss."""
         space, pixels = self.space, step.camera.width * step.camera.height
         size = step.camera.width, step.camera.height
         weights = step.ssim_weight, step.l2_weight, step.image.gain
         if step.image.surroundings is None:
             loss = l1_ssim(space, image.color, target.photograph, size, *weights)
-            return loss.gradient, loss
+            # Nothing writes to this buffer, which is zero from the start.
+            return loss.gradient, space.get("zeros", 8 * pixels), loss
         composed = space.get("composed image", 12 * pixels)
         around = target.layers, pixels, step.alpha_loss
         compose(
@@ -182,25 +296,29 @@ class GpuTraining(ResidentTraining):
         )  # fmt: skip
         loss = l1_ssim(space, composed, target.photograph, size, *weights)
         d_color = space.get("gradient of the part", 12 * pixels)
+        d_planes = space.get("gradients of alpha and depth", 8 * pixels)
+        self.gpu.clear(d_planes)
         compose(
             space, "compose.backward", *around, alpha=image.planes, values=loss.gradient,
             result=d_color, d_alpha=d_planes,
         )  # fmt: skip
-        return d_color, loss
+        return d_color, d_planes, loss
 
-    def _add_other_losses(
+    def _with_other_losses(
         self, step: ResidentStep, image: rasterise.Image, d_planes: Buffer
-    ) -> None:
-        """Add to the gradients on alpha and depth (2, H, W)."""
+    ) -> Buffer:
+        """The gradients on alpha and depth (2, H, W) with those of the step's other losses."""
         if step.losses is None:
-            return
+            return d_planes
         shape = step.camera.height, step.camera.width
         both = self.gpu.read(d_planes, np.float32, 2 * shape[0] * shape[1]).reshape(2, *shape)
         found = step.losses(_Planes(self.gpu, image))
         for part, gradient in zip(both, found, strict=True):
             if gradient is not None:
                 part += gradient.numpy()
-        self.gpu.write(d_planes, both)
+        result = self.space.get("gradients of alpha and depth", both.nbytes)
+        self.gpu.write(result, both)
+        return result
 
     def _moments(self, name: str) -> dict[str, Buffer]:
         first, second = self.buffers[f"first {name}"], self.buffers[f"second {name}"]
@@ -228,13 +346,6 @@ class GpuTraining(ResidentTraining):
     def _gradients(self) -> Buffer:
         return self.space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * self.scene.count)
 
-    def _embedding_gradient(self, step: ResidentStep) -> tuple[float, ...] | None:
-        if step.embedding is None:
-            return None
-        size, count = len(step.embedding), self.scene.count
-        rows = self.space.get("gradients of the embedding", 4 * size * count)
-        return tuple(sum_rows(self.space, rows, count, size).tolist())
-
     def _observe(
         self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
     ) -> None:
@@ -249,6 +360,7 @@ class GpuTraining(ResidentTraining):
             radii=projection.radii,
             gradient_sum=self.buffers["gradient_sum"],
             seen=self.buffers["seen"],
+            stopped=self.stopped,
         )
 
     def _optimise(self, rates: Mapping[str, AdamRates], gradients: Buffer) -> None:
@@ -265,6 +377,7 @@ class GpuTraining(ResidentTraining):
                 mean_avg_sq=buffers["second means"],
                 rotation_avg=buffers["first quats"],
                 rotation_avg_sq=buffers["second quats"],
+                stopped=self.stopped,
             )
         if "appearance" in buffers:
             width = 3 * self.embedding_size
@@ -276,6 +389,7 @@ class GpuTraining(ResidentTraining):
                 shared=False,
                 gradient=space.get("gradients of the appearance", 4 * width * scene.count),
                 parameter=buffers["appearance"],
+                stopped=self.stopped,
                 **self._moments("appearance"),
             )
         for name, (at, _) in layout.offsets(layout.GEOMETRY, scene.count).items():
@@ -290,6 +404,7 @@ class GpuTraining(ResidentTraining):
                 at=at,
                 gradient=gradients,
                 parameter=scene.geometry,
+                stopped=self.stopped,
                 **self._moments(name),
             )
 

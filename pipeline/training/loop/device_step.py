@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from torch import Tensor
 
@@ -13,6 +16,7 @@ from pipeline.render.resident import (
     ResidentStep,
     ResidentTraining,
 )
+from pipeline.render.resident import StepResult as ResidentResult
 from pipeline.training.data.targets import psnr_of
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
@@ -21,9 +25,22 @@ from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
 from pipeline.training.losses.plane import summed_gradients
 from pipeline.training.run import TrainingRun
 
+# The number of steps whose results are read at once.
+READ_INTERVAL = 16
+
+
+@dataclass(frozen=True)
+class _Started:
+    """A step whose result has not been read, and its number."""
+
+    number: int
+    step: Step
+
 
 class DeviceStep(StepEngine):
-    """Renders, differentiates and updates on a device.
+    """Renders, differentiates and updates on a device. It makes steps without waiting for their
+    results, unless the next step depends on them: refined cameras and embeddings are updated on the
+    CPU.
 
     Before the tensors of ``state`` are read, ``fetch`` makes them current; after they were changed,
     ``invalidate`` makes the next step copy them again.
@@ -41,8 +58,9 @@ class DeviceStep(StepEngine):
         self.training = training
         self._loaded = False  # The device has the tensors of the state, or newer ones.
         self._ahead = False  # The device has newer ones.
+        self._started: list[_Started] = []
 
-    def step(self, step: Step) -> StepResult:
+    def step(self, step: Step) -> Sequence[StepResult]:
         state, view, options = self.state, step.view, self.run.options
         if not self._loaded:
             self.training.load(self._optimised())
@@ -52,11 +70,13 @@ class DeviceStep(StepEngine):
         if state.appearance is not None:
             embedding = tuple(state.appearance.embeddings[view.index])
 
-        def losses(planes: Planes) -> tuple[Tensor | None, Tensor | None]:
-            return summed_gradients(self.losses, planes, view, state.step)
+        number = state.step
 
-        has_losses = any(loss.is_due(view, state.step) for loss in self.losses)
-        result = self.training.step(
+        def losses(planes: Planes) -> tuple[Tensor | None, Tensor | None]:
+            return summed_gradients(self.losses, planes, view, number)
+
+        has_losses = any(loss.is_due(view, number) for loss in self.losses)
+        self.training.step(
             ResidentStep(
                 camera=view.camera,
                 options=step.options,
@@ -70,16 +90,30 @@ class DeviceStep(StepEngine):
                 adam=state.adam.rates(step.adam),
             )
         )
-        self.require_finite(result.loss, view)
+        self._started.append(_Started(number, step))
+        depends = state.cameras.enabled or state.appearance is not None
+        return self.results() if depends or len(self._started) == READ_INTERVAL else []
+
+    def results(self) -> Sequence[StepResult]:
+        started, self._started = self._started, []
+        if not started:
+            return []
+        return [self._finish(*pair) for pair in zip(started, self.training.results(), strict=True)]
+
+    def _finish(self, started: _Started, result: ResidentResult) -> StepResult:
+        """Update the camera and the embedding of a step's photograph."""
+        state, step, view = self.state, started.step, started.step.view
+        self.require_finite(result.loss, view, started.number)
         if result.camera is not None:
             state.cameras.step(view.index, view.camera, result.camera, step.camera_rate)
         if state.appearance is not None and result.embedding is not None:
             gradient = np.array(result.embedding)
             state.appearance.update(view.index, gradient, self.embedding_rate(step))
         psnr = psnr_of(result.squared_error) if step.measures_psnr else None
-        return StepResult(result.loss, psnr, result.num_visible, result.num_dropped)
+        return StepResult(started.number, result.loss, psnr, result.num_visible, result.num_dropped)
 
     def fetch(self) -> None:
+        assert not self._started
         if self._ahead:
             self.training.store(self._optimised())
             self._ahead = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.render import Backend, Gradients, RasterOptions
@@ -30,7 +31,7 @@ class OperatorStep(StepEngine):
             run.threads,
         )
 
-    def step(self, step: Step) -> StepResult:
+    def step(self, step: Step) -> Sequence[StepResult]:
         state, view = self.state, step.view
         gaussians, appearance = state.gaussians, state.appearance
         shown = None if appearance is None else appearance.show(gaussians, view.index)
@@ -40,7 +41,7 @@ class OperatorStep(StepEngine):
             drawn = replace(gaussians, opacity_logits=opacities.logits)
         rendered = self.backend.forward(*drawn.parameters(), view.camera, step.options)
         color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
-        self.require_finite(color.loss, view)
+        self.require_finite(color.loss, view, state.step)
         others = summed_gradients(self.losses, rendered, view, state.step)
         gradients = self.backend.backward(
             rendered,
@@ -58,7 +59,15 @@ class OperatorStep(StepEngine):
         self._update_cameras(step, gradients)
         state.density.before_step(gaussians, rendered, gradients)
         state.adam.step(gaussians, gradients, step.adam, self.run.threads)
-        return StepResult(color.loss, color.psnr, rendered.num_visible, rendered.num_dropped)
+        return [
+            StepResult(
+                state.step, color.loss, color.psnr, rendered.num_visible, rendered.num_dropped
+            )
+        ]
+
+    def results(self) -> Sequence[StepResult]:
+        """There are none: ``step`` returns the result of each step."""
+        return []
 
     def _thinned(self, step: Step) -> ThinnedOpacities | None:
         """The opacities of the step; None without drop-out."""

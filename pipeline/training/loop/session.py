@@ -49,13 +49,16 @@ class Session:
         self.metrics_log = MetricsLog(run.logs and run.logs / NAME, state.step)
         self.timer = StepTimer(self.build, run.threads, run.span.stop - state.clock)
 
-    def after_step(self, before: int, factor: int, fetch: Callable[[], None]) -> None:
+    def after_step(
+        self, before: int, factor: int, settle: Callable[[], None], fetch: Callable[[], None]
+    ) -> None:
         """Log, record and save what is due after a step.
 
         Args:
             before: ``state.clock`` before the step.
             factor: The factor by which images are reduced.
-            fetch: The function that makes the tensors of the state current (``StepEngine.fetch``).
+            settle: The function that makes the figures of the state current (``Trainer.settle``).
+            fetch: The function that makes all of the state current (``Trainer.fetch``).
         """
         state, last = self.state, self.run.span.stop
         now = time.monotonic()
@@ -64,6 +67,7 @@ class Session:
             self.log(text)
         interval = max(1, len(self.run.span) // CURVE_RECORDS)
         if state.clock // interval > before // interval or state.clock == last:
+            settle()
             state.record()
         if now - self.saved >= CHECKPOINT_SECONDS and state.clock < last:
             self._save(fetch)

@@ -41,8 +41,9 @@ class Step:
 
 @dataclass(frozen=True)
 class StepResult:
-    """The figures of a step; ``psnr`` in dB, None if it was not measured."""
+    """The figures of step ``number``; ``psnr`` in dB, None if it was not measured."""
 
+    number: int
     loss: float
     psnr: float | None
     num_visible: int
@@ -59,26 +60,39 @@ class StepEngine(ABC):
         self.losses = plane_losses(scene, run)
 
     @abstractmethod
-    def step(self, step: Step) -> StepResult:
+    def step(self, step: Step) -> Sequence[StepResult]:
         """Change ``state`` by one step.
 
+        Returns:
+            The results that are known, in order: that of this step, or those of steps before.
+
         Raises:
-            UserError: The loss is not finite.
+            UserError: The loss of one of these steps is not finite.
+        """
+
+    @abstractmethod
+    def results(self) -> Sequence[StepResult]:
+        """Complete all steps; returns the results that ``step`` has not returned, in order.
+
+        Raises:
+            UserError: As ``step``.
         """
 
     @abstractmethod
     def fetch(self) -> None:
-        """Make the tensors of ``state`` current, before they are read."""
+        """Make the tensors of ``state`` current, before they are read. To be called after
+        ``results``."""
 
     @abstractmethod
     def invalidate(self) -> None:
         """Make the tensors of ``state`` current, and read them again before the next step. To be
-        called before they are changed."""
+        called after ``results`` and before they are changed."""
 
-    def require_finite(self, loss: float, view: StepView) -> None:
+    def require_finite(self, loss: float, view: StepView, number: int) -> None:
+        """Raise a UserError if the loss of step ``number`` is not finite."""
         if not math.isfinite(loss):
             raise UserError(
-                f"the loss is not finite at step {self.state.step}, view {view.full.name}",
+                f"the loss is not finite at step {number}, view {view.full.name}",
                 fix="lower experiments.train.learning_rate_factor, or check the poses and points",
             )
 

@@ -66,7 +66,7 @@ def train(
             while state.clock < run.span.stop:
                 before = state.clock
                 trainer.step()
-                session.after_step(before, trainer.factor(), trainer.engine.fetch)
+                session.after_step(before, trainer.factor(), trainer.settle, trainer.fetch)
         trainer.finish()
         # The overviews of a block may show only Gaussians of other blocks.
         if state.counters.blind_steps and inputs.open_layers is None:

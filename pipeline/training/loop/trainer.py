@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pipeline.config.settled import TrainOptions
@@ -66,7 +68,7 @@ class Trainer:
         rates = self.schedule.learning_rates(
             state.clock, run_length, self.rate_unit, warm_up(self.run.span, state.step)
         )
-        result = self.engine.step(
+        results = self.engine.step(
             Step(
                 view,
                 self.raster_options(view.background),
@@ -78,14 +80,14 @@ class Trainer:
                 dropped_share=self.dropped_share(),
             )
         )
-        self.count(result)
+        self.count(results)
         self.control_density(steps, run_length)
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
 
     def finish(self) -> None:
         """Remove the Gaussians that had no gradient in the last epoch, and those on the path
         between cameras that hide the scene from there."""
-        self.engine.fetch()
+        self.fetch()
         self.backend.release_memory()
         state = self.state
         state.drop_unseen(len(self.scene.views), self.scene.sky)
@@ -93,6 +95,20 @@ class Trainer:
             before, views = len(state.gaussians), self.reduced_views()
             state.gaussians = self.floaters.without_blockers(state.gaussians, views)
             state.counters.floaters += before - len(state.gaussians)
+
+    def settle(self) -> None:
+        """Wait for the results of all steps, before the figures of ``state`` are read."""
+        self.count(self.engine.results())
+
+    def fetch(self) -> None:
+        """Make ``state`` current, before it is read."""
+        self.settle()
+        self.engine.fetch()
+
+    def invalidate(self) -> None:
+        """Make ``state`` current, before its tensors are changed."""
+        self.settle()
+        self.engine.invalidate()
 
     def next_view(self) -> StepView:
         """The view of this step: each view once in each shuffled epoch, but for that held back."""
@@ -142,7 +158,7 @@ class Trainer:
         transients_due = state.transients is not None and state.transients.is_due(steps, run_length)
         if not floaters_due and not transients_due and not state.density.is_due(steps):
             return
-        self.engine.invalidate()
+        self.invalidate()
         faded = self.fade_ghosts() if transients_due else 0
         faded += self.fade_floaters() if floaters_due else 0
         if self.run.is_part:
@@ -195,7 +211,7 @@ class Trainer:
         """Allocate the coefficients of higher degrees when they come into use."""
         degree = self.schedule.sh_degree_at(self.state.clock)
         if degree > self.state.gaussians.sh_degree:
-            self.engine.invalidate()
+            self.invalidate()
             self.state.gaussians = self.state.gaussians.with_sh_degree(degree)
             self.state.adam.resize_bands(degree)
 
@@ -256,18 +272,19 @@ class Trainer:
             return red, green, blue
         return BACKGROUNDS[self.scene.background]
 
-    def count(self, result: StepResult) -> None:
-        """Add a step to the counters and the curve; stop if no view sees a Gaussian."""
+    def count(self, results: Sequence[StepResult]) -> None:
+        """Add steps to the counters and the curve; stop if no view sees a Gaussian."""
         state, counters, views = self.state, self.state.counters, self.scene.views
-        state.add_to_window(result.loss, result.psnr)
-        counters.num_dropped += result.num_dropped
-        counters.blind_steps += result.num_visible == 0
-        if state.step >= len(views) and counters.blind_steps == state.step:
-            raise UserError(
-                f"no camera sees any Gaussian ({len(views)} views tried)",
-                fix="check that the poses and the points have the same frame and that the poses "
-                "are world to camera, x right, y down, z forward",
-            )
+        for result in results:
+            state.add_to_window(result.loss, result.psnr)
+            counters.num_dropped += result.num_dropped
+            counters.blind_steps += result.num_visible == 0
+            if result.number >= len(views) and counters.blind_steps == result.number:
+                raise UserError(
+                    f"no camera sees any Gaussian ({len(views)} views tried)",
+                    fix="check that the poses and the points have the same frame and that the "
+                    "poses are world to camera, x right, y down, z forward",
+                )
 
 
 def make_engine(

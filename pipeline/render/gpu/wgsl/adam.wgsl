@@ -9,11 +9,12 @@
 @group(0) @binding(3) var<storage, read_write> parameter: array<f32>;
 @group(0) @binding(4) var<storage, read_write> exp_avg: array<f32>;
 @group(0) @binding(5) var<storage, read_write> exp_avg_sq: array<f32>;
+@group(0) @binding(6) var<uniform> stopped: u32;  // see admit.wgsl
 
 @compute @workgroup_size(kThreads)
 fn elements(thread: Thread) {
     let i = number_of(thread);
-    if (i >= adam.count) { return; }
+    if (i >= adam.count || stopped != 0u) { return; }
     let g = gradient[adam.at + i];
     let m = exp_avg[i] * adam.beta1 + g * adam.rest1;
     let v = exp_avg_sq[i] * adam.beta2 + g * g * adam.rest2;
@@ -25,7 +26,7 @@ fn elements(thread: Thread) {
 @compute @workgroup_size(kThreads)
 fn rows(thread: Thread) {
     let row = number_of(thread);
-    if (row >= adam.count) { return; }
+    if (row >= adam.count || stopped != 0u) { return; }
     var squares = 0.0;
     for (var k = 0u; k < adam.width; k++) {
         let g = gradient[adam.at + row * adam.width + k];

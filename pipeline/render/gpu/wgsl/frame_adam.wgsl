@@ -11,6 +11,7 @@
 @group(0) @binding(4) var<storage, read_write> mean_avg_sq: array<f32>;
 @group(0) @binding(5) var<storage, read_write> rotation_avg: array<f32>;
 @group(0) @binding(6) var<storage, read_write> rotation_avg_sq: array<f32>;
+@group(0) @binding(7) var<uniform> stopped: u32;  // see admit.wgsl
 
 // Log scales are clamped to plus or minus this (1e-12 and 1e12).
 const kLnUnitMax = 28.0;
@@ -37,7 +38,7 @@ fn step(m: Moments) -> vec3<f32> {
 fn main(thread: Thread) {
     let i = number_of(thread);
     let n = adam.count;
-    if (i >= n) { return; }
+    if (i >= n || stopped != 0u) { return; }
     let mean = 3u * i;
     let log_scale = 3u * (n + i);
     let quat = 6u * n + 4u * i;

@@ -8,7 +8,7 @@ struct Size {
     count: u32,
     tiles: u32,
     tiles_x: u32,
-    pairs: u32,
+    capacity: u32,  // of the arrays of pairs
 }
 
 @group(0) @binding(0) var<uniform> size: Size;
@@ -31,7 +31,7 @@ fn main(thread: Thread) {
     let r = records[i];
     let box = boxes[i];
     var next = first[rank];
-    let end = min(next + tile_counts[i], size.pairs);
+    let end = min(next + tile_counts[i], size.capacity);
     slots[i] = next;
     for (var y = box.top; y <= box.bottom; y++) {
         for (var x = box.left; x <= box.right; x++) {

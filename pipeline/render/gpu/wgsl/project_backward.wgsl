@@ -26,6 +26,7 @@ const kCamera = 2u;
 @group(0) @binding(11) var<storage, read_write> exp_avg_sq: array<f32>;
 @group(0) @binding(12) var<storage, read_write> last_step: array<i32>;
 @group(0) @binding(13) var<storage, read_write> d_camera: array<f32>;  // (N, kCameraParameters)
+@group(0) @binding(14) var<uniform> stopped: u32;  // see admit.wgsl
 #import geometry
 
 const kLn2 = 0.6931471805599453;
@@ -110,7 +111,7 @@ fn step_sh(at: u32, gradient: f32, rate: f32, missed: Missed) {
 @compute @workgroup_size(kThreads)
 fn main(thread: Thread) {
     let i = number_of(thread);
-    if (i >= view.gaussians) { return; }
+    if (i >= view.gaussians || stopped != 0u) { return; }
     var m: array<f32, kMoments>;
     var most = 0.0;
     for (var s = 0u; s < tile_counts[i]; s++) {

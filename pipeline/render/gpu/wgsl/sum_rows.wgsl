@@ -4,6 +4,7 @@
 struct Size {
     rows: u32,
     columns: u32,  // at most kThreads
+    at: u32,       // first element of the sums
 }
 
 @group(0) @binding(0) var<uniform> size: Size;
@@ -21,5 +22,5 @@ fn main(thread: Thread) {
     for (var row = begin; row < min(begin + kRows, size.rows); row++) {
         sum += values[row * size.columns + thread.local];
     }
-    sums[block * size.columns + thread.local] = sum;
+    sums[size.at + block * size.columns + thread.local] = sum;
 }

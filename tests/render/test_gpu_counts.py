@@ -1,0 +1,49 @@
+"""The waits, dispatches and bytes of a training step on a GPU. They are the same on each card, and
+hold the step to what it was made for where no card can time it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from benchmarks.gpu_counts import counted_steps
+from pipeline.render import make_backend
+from pipeline.render.calibration import StepScene
+from pipeline.render.gpu import kernels
+from pipeline.render.gpu.backend import GpuBackend
+from pipeline.render.gpu.counts import Counts
+from tests.render.scenes import camera, random_scene
+from tests.tools import need_gpu
+
+STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def counts() -> Counts:
+    need_gpu()
+    backend = make_backend("gpu")
+    assert isinstance(backend, GpuBackend)
+    target = torch.zeros(48, 64, 3, dtype=torch.uint8)
+    scene = StepScene(random_scene(1, 1500), camera(64, 48), target)
+    return counted_steps(backend, scene, STEPS)[0]
+
+
+def test_steps_do_not_wait_for_the_device(counts: Counts) -> None:
+    """Only the results of all steps are read."""
+    assert counts.waits == 1
+
+
+def test_a_step_takes_few_dispatches(counts: Counts) -> None:
+    assert counts.dispatches <= 63 * STEPS
+    assert counts.copies == 0
+    assert counts.submissions <= 2 * STEPS
+
+
+def test_moments_are_read_and_written_once(counts: Counts) -> None:
+    for name in ("first sh", "second sh", "second opacity_logits"):
+        assert counts.read[name] == counts.written[name] > 0
+
+
+def test_outputs_are_not_counted_as_inputs() -> None:
+    found = {b.name: b.only_written for b in kernels.source("project_backward").bindings}
+    assert found["gradients"] and not found["sh"] and not found["slots"]

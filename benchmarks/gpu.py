@@ -33,12 +33,12 @@ from pipeline.runtime.errors import UserError
 PHASES = {
     "projection, SH": ("project",),
     "bin": ("scan.blocks", "scan.add", "compact", "sort.histogram", "sort.scatter", "order",
-            "pairs", "ranges"),
+            "admit", "pairs", "ranges"),
     "blend": ("blend",),
     "loss": ("loss.forward", "loss.backward", "sum_rows"),
     "blend backward": ("blend_backward",),
     "projection backward": ("project_backward",),
-    "Adam, statistics": ("observe", "frame_adam", "adam.elements"),
+    "Adam, statistics": ("optimise",),
 }  # fmt: skip
 COPIED = 1 << 28  # The number of bytes that the measurement of bandwidth copies.
 

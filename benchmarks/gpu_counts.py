@@ -2,7 +2,11 @@
 
     python -m benchmarks.gpu_counts --gaussians 1000000 --size 1600x1067
 
-The counts are means of a step; results are read after the last one.
+The counts are means of a step; results are read after the last one. From the counts and the peaks
+of some cards follows an estimate of a step's time: a model, which no card has confirmed. In it,
+bytes move at the full bandwidth and none comes from a cache, each pixel of a tile blends all of the
+tile's Gaussians at the full arithmetic, which does not overlap with the bytes, and each dispatch
+takes some microseconds of its own.
 """
 
 from __future__ import annotations
@@ -11,28 +15,79 @@ import argparse
 import sys
 import time
 from collections import Counter
+from dataclasses import dataclass
 
 import torch
 
 from benchmarks.raster.scenes import size_of, synthetic
-from pipeline.render import make_backend
+from pipeline.render import RasterOptions, make_backend
 from pipeline.render.calibration import StepScene, training_step
+from pipeline.render.gpu import layout
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.counts import Counts
 from pipeline.runtime.errors import UserError
 
 SHOWN = 14  # The number of buffers that are printed.
+# Operations of a pixel and a Gaussian of its tile, in blending and its backward pass, of a pixel in
+# the loss, and of a Gaussian: as counted in benchmarks.raster.measure.
+PAIR_PIXEL_FLOPS, PIXEL_FLOPS, GAUSSIAN_FLOPS = 28 + 56, 906, 1200
+DISPATCH_SECONDS = 4e-6  # Assumed: the start of a kernel and the barrier before it.
+
+
+@dataclass(frozen=True)
+class Card:
+    """The peaks of a card by its maker: bytes and float32 operations per second."""
+
+    name: str
+    bandwidth: float
+    flops: float
+
+    def milliseconds(self, step: StepWork) -> tuple[float, float, float]:
+        """The modelled times of memory, of arithmetic and of starting kernels, in a step."""
+        parts = step.bytes / self.bandwidth, step.flops / self.flops
+        return 1e3 * parts[0], 1e3 * parts[1], 1e3 * DISPATCH_SECONDS * step.dispatches
+
+
+@dataclass(frozen=True)
+class StepWork:
+    """The work of a step on the device."""
+
+    bytes: float
+    flops: float
+    dispatches: float
+
+
+CARDS = (
+    Card("H100 SXM", 3.35e12, 66.9e12),
+    Card("RTX 4090", 1.01e12, 82.6e12),
+    Card("Arc A770", 0.56e12, 19.7e12),
+    Card("M2, 10 cores", 0.10e12, 3.6e12),
+)
+
+
+def print_model(backend: GpuBackend, scene: StepScene, counts: Counts, steps: int) -> None:
+    """Print the modelled time of a step on each card."""
+    camera, count = scene.camera, len(scene.gaussians[0])
+    pairs = backend.forward(*scene.gaussians, camera, RasterOptions()).num_intersections
+    flops = PAIR_PIXEL_FLOPS * layout.TILE**2 * pairs + GAUSSIAN_FLOPS * count
+    flops += PIXEL_FLOPS * camera.width * camera.height
+    size = sum(part.total() for part in counts.traffic()) / steps
+    work = StepWork(size, flops, counts.dispatches / steps)
+    print(f"{pairs} pairs, {flops / 1e9:.1f} GFLOP\nmodel, ms: memory + arithmetic + dispatches")
+    for card in CARDS:
+        parts = card.milliseconds(work)
+        print(f"  {card.name:14} {sum(parts):7.2f} = " + " + ".join(f"{p:.2f}" for p in parts))
 
 
 def counted_steps(backend: GpuBackend, scene: StepScene, steps: int) -> tuple[Counts, float]:
-    """The counts of ``steps`` training steps, and the seconds of the processor's work in one."""
+    """The counts of ``steps`` training steps, and the seconds of one in the thread that records."""
     step = training_step(backend, scene, steps)
     step()  # Allocates memory and compiles kernels.
     gpu = backend.gpu
-    gpu.counts = counts = Counts()
-    start = time.process_time()
+    gpu.counts = counts = Counts(groups=Counter())
+    start = time.thread_time()
     step()
-    return counts, (time.process_time() - start) / steps
+    return counts, (time.thread_time() - start) / steps
 
 
 def report(counts: Counts, steps: int) -> None:
@@ -40,12 +95,14 @@ def report(counts: Counts, steps: int) -> None:
     print(f"waits        {counts.waits / steps:8.2f}")
     for name in ("dispatches", "copies", "submissions"):
         print(f"{name:12} {getattr(counts, name) / steps:8.1f}")
-    for name in ("uploaded", "downloaded", "bytes"):
+    for name in ("uploaded", "downloaded"):
         print(f"{name:12} {getattr(counts, name) / steps / 1e6:8.2f} MB")
-    both: Counter[str] = counts.read + counts.written
+    read, written = ({k: v / steps / 1e6 for k, v in part.items()} for part in counts.traffic())
+    both = Counter(read) + Counter(written)
+    print(f"bytes        {both.total():8.2f} MB")
     for name, size in both.most_common(SHOWN):
-        read, written = counts.read[name] / steps / 1e6, counts.written[name] / steps / 1e6
-        print(f"  {name:32} {size / steps / 1e6:8.2f} MB: {read:8.2f} read, {written:8.2f} written")
+        parts = f"{read.get(name, 0):8.2f} read, {written.get(name, 0):8.2f} written"
+        print(f"  {name:32} {size:8.2f} MB: {parts}")
 
 
 def main() -> int:
@@ -65,15 +122,15 @@ def main() -> int:
         assert isinstance(backend, GpuBackend)
         scene = synthetic(args.gaussians, width, height, radius=5.0)
         target = torch.full((height, width, 3), 128, dtype=torch.uint8)
-        counts, seconds = counted_steps(
-            backend, StepScene(scene.gaussians, scene.camera, target), args.steps
-        )
+        step_scene = StepScene(scene.gaussians, scene.camera, target)
+        counts, seconds = counted_steps(backend, step_scene, args.steps)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(f"{args.gaussians} Gaussians, {width}x{height}; means of {args.steps} steps")
     report(counts, args.steps)
-    print(f"processor    {1e3 * seconds:8.2f} ms, with the kernels if the device is in software")
+    print(f"processor    {1e3 * seconds:8.2f} ms of the thread that records a step")
+    print_model(backend, step_scene, counts, args.steps)
     return 0
 
 

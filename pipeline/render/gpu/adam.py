@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from pipeline.render.gpu import layout
 from pipeline.render.gpu.device import Buffer, blocks
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AdamRates
@@ -51,6 +54,43 @@ def frame_adam(space: Workspace, rates: AdamRates, count: int, **buffers: Buffer
     """
     adam = uniform(space, "Adam of frames", rates, count)
     space.run("frame_adam", blocks(count), adam=adam, **buffers)
+
+
+def optimise(
+    space: Workspace,
+    rates: Mapping[str, AdamRates],
+    count: int,
+    half_size: tuple[float, float],
+    *,
+    moments: Mapping[str, Buffer],
+    **buffers: Buffer,
+) -> None:
+    """Update log scales, opacities, means and rotations by ``Backend.adam_step`` and
+    ``Backend.frame_adam``, and the statistics of density control.
+
+    Args:
+        rates: The rates of ``log_scales`` and ``opacity_logits``, and of ``frames``, without which
+            means and rotations are not updated. They differ in the learning rates only.
+        half_size: Half of the width and height of the image.
+        moments: The moments of a parameter ``name`` are ``first name`` and ``second name``.
+        buffers: ``gradients``, ``geometry``, ``radii``, ``statistics`` and ``stopped``.
+    """
+    scales, opacities = rates["log_scales"], rates["opacity_logits"]
+    common, frames = rates.get("frames", scales), "frames" in rates
+    assert len({replace(each, lr=0.0) for each in (scales, opacities, common)}) == 1
+    at, _ = layout.offsets(layout.GRADIENTS, count)["means2d"]
+    names = {"scale": "log_scales", "opacity": "opacity_logits"}
+    names |= {"mean": "means", "rotation": "quats"} if frames else {}
+    options = (layout.FRAMES * frames, at, *half_size, *_corrected(scales), *_corrected(opacities))
+    space.run(
+        "optimise",
+        blocks(count),
+        adam=uniform(space, "Adam", common, count),
+        options=space.uniform("options of Adam", "II4f", *options),
+        **{f"{short}_avg": moments[f"first {name}"] for short, name in names.items()},
+        **{f"{short}_avg_sq": moments[f"second {name}"] for short, name in names.items()},
+        **buffers,
+    )
 
 
 def uniform(

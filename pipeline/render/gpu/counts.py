@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.render.gpu.kernels import Binding
+
+
+@dataclass(frozen=True, eq=False)
+class BindGroup:
+    """The buffers of a kernel.
+
+    Attributes:
+        group: The ``wgpu.GPUBindGroup``.
+        buffers: The buffers with their bindings, without placeholders.
+    """
+
+    group: Any
+    buffers: tuple[tuple[Binding, Any], ...]
 
 
 @dataclass
@@ -24,7 +36,9 @@ class Counts:
         copies: The number of copies and clears of buffers, which interrupt a pass.
         submissions: The number of submitted command buffers.
         uploaded, downloaded: Bytes copied to the device and from it.
-        read, written: The bytes of the device's memory, by the names of the buffers.
+        groups: The number of dispatches with each bind group; None: they are not counted, since
+            that keeps the memory of their buffers.
+        copied, cleared: The bytes that copies read, and those that copies and clears write.
     """
 
     waits: int = 0
@@ -33,26 +47,31 @@ class Counts:
     submissions: int = 0
     uploaded: int = 0
     downloaded: int = 0
-    read: Counter[str] = field(default_factory=Counter)
-    written: Counter[str] = field(default_factory=Counter)
+    groups: Counter[BindGroup] | None = None
+    copied: Counter[str] = field(default_factory=Counter)
+    cleared: Counter[str] = field(default_factory=Counter)
 
-    @property
-    def bytes(self) -> int:
-        """The bytes of the device's memory that are read and written."""
-        return self.read.total() + self.written.total()
+    def traffic(self) -> tuple[Counter[str], Counter[str]]:
+        """The bytes of the device's memory that are read and written, by the names of buffers."""
+        read, written = Counter(self.copied), self.cleared.copy()
+        assert self.groups is not None
+        for group, times in self.groups.items():
+            for binding, buffer in group.buffers:
+                if binding.kind == "read_write":
+                    written[buffer.label] += times * buffer.size
+                if not binding.only_written:
+                    read[buffer.label] += times * buffer.size
+        return read, written
 
-    def add_dispatch(self, bound: Iterable[tuple[Binding, Any]]) -> None:
+    def add_dispatch(self, group: BindGroup) -> None:
         """Count a kernel with its buffers."""
         self.dispatches += 1
-        for binding, buffer in bound:
-            if binding.kind == "read_write":
-                self.written[buffer.label] += buffer.size
-            if not binding.only_written:
-                self.read[buffer.label] += buffer.size
+        if self.groups is not None:
+            self.groups[group] += 1
 
     def add_copy(self, source: Any, target: Any, size: int) -> None:
         """Count a copy; ``source`` is None if the buffer is cleared."""
         self.copies += 1
         if source is not None:
-            self.read[source.label] += size
-        self.written[target.label] += size
+            self.copied[source.label] += size
+        self.cleared[target.label] += size

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.render.gpu.counts import Counts
-from pipeline.render.gpu.kernels import Binding, source
+from pipeline.render.gpu.counts import BindGroup, Counts
+from pipeline.render.gpu.kernels import source
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import install_extra
 
@@ -89,19 +89,6 @@ class KernelTimer(Protocol):
 
     def timestamp_writes(self, kernel: str) -> dict[str, Any]:
         """Return the queries of the pass of the next kernel."""
-
-
-@dataclass(frozen=True)
-class BindGroup:
-    """The buffers of a kernel.
-
-    Attributes:
-        group: The ``wgpu.GPUBindGroup``.
-        buffers: The buffers with their bindings, without placeholders.
-    """
-
-    group: Any
-    buffers: tuple[tuple[Binding, Buffer], ...]
 
 
 class Gpu:
@@ -271,7 +258,7 @@ class Gpu:
         self._pass.set_pipeline(self._pipeline(kernel)[0])
         self._pass.set_bind_group(0, bound.group)
         self._pass.dispatch_workgroups(*groups)
-        self.counts.add_dispatch(bound.buffers)
+        self.counts.add_dispatch(bound)
 
     def clear(self, buffer: Buffer) -> None:
         """Fill a buffer with zeros."""

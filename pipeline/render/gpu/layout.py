@@ -25,10 +25,12 @@ ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
 BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
 FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
 SH_ADAM, CAMERA = 1, 2  # flags of Adam in project_backward.wgsl
+FRAMES = 1  # flag of Options in optimise.wgsl
 
 # The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the
 # offsets of the parameters, project_backward.wgsl those of the gradients.
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
+STATISTICS = {"gradient_sum": 1, "seen": 1}
 GRADIENTS = GEOMETRY | {"means2d": 2, "colors": 3}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render.gpu import layout
+from pipeline.render.gpu.counts import BindGroup
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AlphaChangeLoss, Surroundings
@@ -32,6 +33,7 @@ class LossImage:
     mask: Buffer | None
     count: int
     is_bytes: bool
+    _groups: dict[str, tuple[tuple[int, ...], BindGroup]] = field(default_factory=dict)
 
     @staticmethod
     def upload(gpu: Gpu, target: Tensor, mask: Tensor | None) -> LossImage:
@@ -48,6 +50,14 @@ class LossImage:
         """The buffers by the names of loss.wgsl."""
         masked = {} if self.mask is None else {"mask": self.mask}
         return {"target_words": self.target, **masked}
+
+    def run(self, gpu: Gpu, kernel: str, groups: tuple[int, int, int], **buffers: Buffer) -> None:
+        """Run a kernel as ``Workspace.run`` does. The bind groups are kept with the image: those of
+        a workspace would keep all images in memory."""
+        key = tuple(map(id, buffers.values()))
+        if kernel not in self._groups or self._groups[kernel][0] != key:
+            self._groups[kernel] = key, gpu.bind(kernel, buffers)
+        gpu.dispatch(kernel, groups, self._groups[kernel][1])
 
 
 @dataclass(frozen=True)
@@ -91,9 +101,8 @@ def l1_ssim(
         "sums": space.get("sums of the loss", 16 * rows),
         **image.buffers,
     }
-    # The workspace would keep the bind groups, and with them every image in memory.
-    space.gpu.run("loss.forward", (*tiles, 3), **arguments)
-    space.gpu.run("loss.backward", (*tiles, 3), **arguments)
+    image.run(space.gpu, "loss.forward", (*tiles, 3), **arguments)
+    image.run(space.gpu, "loss.backward", (*tiles, 3), **arguments)
     return LossSums(arguments["gradient"], arguments["sums"], rows, image.count)
 
 
@@ -126,5 +135,5 @@ def compose(
     flags = layout.FRONT * ("front" in layers) | layout.CORRECTION * ("correction" in layers)
     factor = 2 * loss.weight / pixels
     sizes = space.gpu.uniform("II4f8x", pixels, flags, loss.fade, loss.growth, factor, 0.0)
-    # As in ``l1_ssim``, the bind group is not kept.
+    # The bind group is not kept: it would keep the layers in memory.
     space.gpu.run(kernel, blocks(pixels), layers=sizes, **layers, **images)

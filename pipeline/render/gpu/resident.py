@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render.gpu import layout, rasterise
-from pipeline.render.gpu.adam import adam_step, frame_adam
+from pipeline.render.gpu.adam import adam_step, optimise
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, upload_layers
 from pipeline.render.gpu.memory import PAIRS_PER_GAUSSIAN, memory_line
@@ -146,6 +146,8 @@ class GpuTraining(ResidentTraining):
         self.buffers = {
             name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
         }
+        statistics = layout.join(layout.STATISTICS, vars(optimised))
+        self.buffers["statistics"] = self._fill("statistics", statistics)
 
     def store(self, optimised: Optimised) -> None:
         self._read_results()
@@ -156,6 +158,10 @@ class GpuTraining(ResidentTraining):
         layout.fetch(self.gpu, scene.sh, parameters["sh"])
         for name, tensor in _others(optimised).items():
             layout.fetch(self.gpu, self.buffers[name], tensor)
+        statistics = self.buffers["statistics"]
+        found = layout.split(layout.STATISTICS, statistics, self.gpu, scene.count)
+        optimised.gradient_sum.copy_(found["gradient_sum"][:, 0])
+        optimised.seen.copy_(found["seen"][:, 0])
 
     def step(self, step: ResidentStep) -> None:
         if self._recorded:
@@ -207,8 +213,7 @@ class GpuTraining(ResidentTraining):
             space.run("appearance.gradient", blocks(scene.count), **appearance)
             rows = appearance["d_weights"]
             sum_blocks(space, rows, scene.count, self.embedding_size, results, at["embedding"])
-        self._observe(step, projection, gradients)
-        self._optimise(step.adam, gradients)
+        self._optimise(step, projection, gradients)
         gpu.submit()
         self._recorded.append(_Recorded(step, loss, at, end))
 
@@ -346,77 +351,66 @@ class GpuTraining(ResidentTraining):
     def _gradients(self) -> Buffer:
         return self.space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * self.scene.count)
 
-    def _observe(
+    def _optimise(
         self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
     ) -> None:
-        count = self.scene.count
-        at, _ = layout.offsets(layout.GRADIENTS, count)["means2d"]
-        half = 0.5 * step.camera.width, 0.5 * step.camera.height
-        self.space.run(
-            "observe",
-            blocks(count),
-            options=self.space.uniform("options of statistics", "IIff", count, at, *half),
+        """Update all parameters but SH, and the statistics."""
+        scene, camera, rates = self.scene, step.camera, step.adam
+        half = 0.5 * camera.width, 0.5 * camera.height
+        optimise(
+            self.space,
+            rates,
+            scene.count,
+            half,
             gradients=gradients,
+            geometry=scene.geometry,
             radii=projection.radii,
-            gradient_sum=self.buffers["gradient_sum"],
-            seen=self.buffers["seen"],
             stopped=self.stopped,
+            statistics=self.buffers["statistics"],
+            moments=self.buffers,
         )
-
-    def _optimise(self, rates: Mapping[str, AdamRates], gradients: Buffer) -> None:
-        """Update all parameters but SH."""
-        space, scene, buffers = self.space, self.scene, self.buffers
-        if "frames" in rates:
-            frame_adam(
-                space,
-                rates["frames"],
-                scene.count,
-                gradients=gradients,
-                geometry=scene.geometry,
-                mean_avg=buffers["first means"],
-                mean_avg_sq=buffers["second means"],
-                rotation_avg=buffers["first quats"],
-                rotation_avg_sq=buffers["second quats"],
-                stopped=self.stopped,
-            )
-        if "appearance" in buffers:
+        if "appearance" in self.buffers:
             width = 3 * self.embedding_size
-            adam_step(
-                space,
-                "appearance",
-                rates["appearance"],
-                (scene.count, width),
-                shared=False,
-                gradient=space.get("gradients of the appearance", 4 * width * scene.count),
-                parameter=buffers["appearance"],
-                stopped=self.stopped,
-                **self._moments("appearance"),
-            )
-        for name, (at, _) in layout.offsets(layout.GEOMETRY, scene.count).items():
-            if name not in rates:
-                continue
-            adam_step(
-                space,
-                name,
-                rates[name],
-                (scene.count, layout.GEOMETRY[name]),
-                shared=name in ("means", "quats"),
-                at=at,
-                gradient=gradients,
-                parameter=scene.geometry,
-                stopped=self.stopped,
-                **self._moments(name),
-            )
+            gradient = self.space.get("gradients of the appearance", 4 * width * scene.count)
+            shape, values = (scene.count, width), self.buffers["appearance"]
+            self._adam_step("appearance", rates, shape, gradient, values)
+        for name in ("means", "quats"):
+            if name in rates:
+                at, _ = layout.offsets(layout.GEOMETRY, scene.count)[name]
+                shape = scene.count, layout.GEOMETRY[name]
+                self._adam_step(name, rates, shape, gradients, scene.geometry, at, shared=True)
+
+    def _adam_step(
+        self,
+        name: str,
+        rates: Mapping[str, AdamRates],
+        shape: tuple[int, int],
+        gradient: Buffer,
+        parameter: Buffer,
+        at: int = 0,
+        *,
+        shared: bool = False,
+    ) -> None:
+        adam_step(
+            self.space,
+            name,
+            rates[name],
+            shape,
+            shared=shared,
+            at=at,
+            gradient=gradient,
+            parameter=parameter,
+            stopped=self.stopped,
+            **self._moments(name),
+        )
 
 
 def _others(optimised: Optimised) -> dict[str, Tensor]:
-    """All tensors but the parameters of the rasterizer, by the names of their buffers."""
+    """All tensors but the parameters of the rasterizer and the statistics, by the names of their
+    buffers."""
     tensors = {f"first {name}": tensor for name, tensor in optimised.first.items()}
     tensors |= {f"second {name}": tensor for name, tensor in optimised.second.items()}
     if (appearance := optimised.parameters.get("appearance")) is not None:
         tensors["appearance"] = appearance
-    return tensors | {
-        "last": optimised.last,
-        "gradient_sum": optimised.gradient_sum,
-        "seen": optimised.seen,
-    }
+    tensors["last"] = optimised.last
+    return tensors

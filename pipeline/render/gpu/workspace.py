@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.render.gpu.counts import BindGroup
 from pipeline.render.gpu.device import Buffer, Gpu
 
 GROWTH = 1.25  # The factor over the needed size if a buffer is replaced by a larger one.
@@ -20,8 +21,8 @@ class Workspace:
         self.gpu = gpu
         self._buffers: dict[str, Buffer] = {}
         self._uniforms: dict[str, tuple[bytes, int]] = {}
-        # The buffers are kept with the groups: their ids are the keys.
-        self._groups: dict[tuple[Any, ...], tuple[Any, dict[str, Buffer]]] = {}
+        # Groups keep their buffers, whose ids are the keys.
+        self._groups: dict[tuple[Any, ...], BindGroup] = {}
 
     def get(self, name: str, size: int) -> Buffer:
         """The buffer of this name, with at least ``size`` bytes."""
@@ -55,5 +56,5 @@ class Workspace:
         if key not in self._groups:
             if len(self._groups) == MAX_GROUPS:
                 self._groups.clear()
-            self._groups[key] = self.gpu.bind(kernel, buffers), buffers
-        self.gpu.dispatch(kernel, groups, self._groups[key][0])
+            self._groups[key] = self.gpu.bind(kernel, buffers)
+        self.gpu.dispatch(kernel, groups, self._groups[key])

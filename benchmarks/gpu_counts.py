@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections import Counter
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +23,7 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.calibration import StepScene, training_step
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.backend import GpuBackend
-from pipeline.render.gpu.counts import Counts
+from pipeline.render.gpu.counts import Counts, Traffic
 from pipeline.runtime.errors import UserError
 
 SHOWN = 14  # The number of buffers that are printed.
@@ -71,8 +70,8 @@ def print_model(backend: GpuBackend, scene: StepScene, counts: Counts, steps: in
     pairs = backend.forward(*scene.gaussians, camera, RasterOptions()).num_intersections
     flops = PAIR_PIXEL_FLOPS * layout.TILE**2 * pairs + GAUSSIAN_FLOPS * count
     flops += PIXEL_FLOPS * camera.width * camera.height
-    size = sum(part.total() for part in counts.traffic()) / steps
-    work = StepWork(size, flops, counts.dispatches / steps)
+    assert counts.traffic is not None
+    work = StepWork(counts.traffic.total / steps, flops, counts.dispatches / steps)
     print(f"{pairs} pairs, {flops / 1e9:.1f} GFLOP\nmodel, ms: memory + arithmetic + dispatches")
     for card in CARDS:
         parts = card.milliseconds(work)
@@ -84,7 +83,7 @@ def counted_steps(backend: GpuBackend, scene: StepScene, steps: int) -> tuple[Co
     step = training_step(backend, scene, steps)
     step()  # Allocates memory and compiles kernels.
     gpu = backend.gpu
-    gpu.counts = counts = Counts(groups=Counter())
+    gpu.counts = counts = Counts(traffic=Traffic())
     start = time.thread_time()
     step()
     return counts, (time.thread_time() - start) / steps
@@ -97,12 +96,12 @@ def report(counts: Counts, steps: int) -> None:
         print(f"{name:12} {getattr(counts, name) / steps:8.1f}")
     for name in ("uploaded", "downloaded"):
         print(f"{name:12} {getattr(counts, name) / steps / 1e6:8.2f} MB")
-    read, written = ({k: v / steps / 1e6 for k, v in part.items()} for part in counts.traffic())
-    both = Counter(read) + Counter(written)
-    print(f"bytes        {both.total():8.2f} MB")
-    for name, size in both.most_common(SHOWN):
-        parts = f"{read.get(name, 0):8.2f} read, {written.get(name, 0):8.2f} written"
-        print(f"  {name:32} {size:8.2f} MB: {parts}")
+    traffic, scale = counts.traffic, 1 / steps / 1e6
+    assert traffic is not None
+    print(f"bytes        {scale * traffic.total:8.2f} MB")
+    for name, size in (traffic.read + traffic.written).most_common(SHOWN):
+        read, written = scale * traffic.read[name], scale * traffic.written[name]
+        print(f"  {name:32} {scale * size:8.2f} MB: {read:8.2f} read, {written:8.2f} written")
 
 
 def main() -> int:

@@ -9,13 +9,13 @@ import torch
 from benchmarks.gpu_counts import counted_steps
 from pipeline.render import make_backend
 from pipeline.render.calibration import StepScene
-from pipeline.render.gpu import kernels
+from pipeline.render.gpu import kernels, resident
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.counts import Counts
 from tests.render.scenes import camera, random_scene
 from tests.tools import need_gpu
 
-STEPS = 20
+STEPS, GAUSSIANS = 20, 1500
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def counts() -> Counts:
     backend = make_backend("gpu")
     assert isinstance(backend, GpuBackend)
     target = torch.zeros(48, 64, 3, dtype=torch.uint8)
-    scene = StepScene(random_scene(1, 1500), camera(64, 48), target)
+    scene = StepScene(random_scene(1, GAUSSIANS), camera(64, 48), target)
     return counted_steps(backend, scene, STEPS)[0]
 
 
@@ -40,11 +40,21 @@ def test_a_step_takes_few_dispatches(counts: Counts) -> None:
 
 
 def test_moments_are_read_and_written_once(counts: Counts) -> None:
-    assert counts.groups is not None
-    sizes = {b.label: b.size for group in counts.groups for _, b in group.buffers}
-    read, written = counts.traffic()
-    for name in ("first sh", "second sh", "first means", "second opacity_logits", "statistics"):
-        assert read[name] == written[name] == STEPS * sizes[name] > 0, name
+    traffic = counts.traffic
+    assert traffic is not None
+    floats = {"first sh": 48, "second sh": 48, "first means": 3, "second opacity_logits": 1,
+              "statistics": 2}  # fmt: skip
+    for name, width in floats.items():
+        expected = 4 * width * GAUSSIANS * STEPS
+        assert traffic.read[name] == traffic.written[name] == expected, name
+
+
+def test_pairs_have_little_room(counts: Counts) -> None:
+    """The kernels of pairs run over the room of their arrays, not over what is allocated."""
+    traffic = counts.traffic
+    assert traffic is not None
+    pairs = traffic.written["Gaussians of pairs"] / 4 / STEPS
+    assert pairs <= max(resident.MIN_CAPACITY, 4 * GAUSSIANS)
 
 
 def test_outputs_are_not_counted_as_inputs() -> None:

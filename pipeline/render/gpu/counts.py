@@ -23,12 +23,37 @@ class BindGroup:
 
 
 @dataclass
+class Traffic:
+    """The bytes of the device's memory that kernels and copies read and write, by the names of the
+    buffers.
+
+    A kernel that is bound to a buffer counts as if it read or wrote each byte in use once. Kernels
+    that gather the same record several times read more, and kernels that leave early less.
+
+    Attributes:
+        used: The bytes of the buffers in use, where these are fewer than all.
+    """
+
+    read: Counter[str] = field(default_factory=Counter)
+    written: Counter[str] = field(default_factory=Counter)
+    used: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        return self.read.total() + self.written.total()
+
+    def add_kernel(self, group: BindGroup) -> None:
+        for binding, buffer in group.buffers:
+            size = min(buffer.size, self.used.get(buffer.label, buffer.size))
+            if binding.kind == "read_write":
+                self.written[buffer.label] += size
+            if not binding.only_written:
+                self.read[buffer.label] += size
+
+
+@dataclass
 class Counts:
     """The work since the counts were made.
-
-    Bytes are those of whole buffers: a kernel that is bound to a buffer counts as if it read or
-    wrote each byte once. Kernels that gather the same record several times read more, and kernels
-    that leave early less.
 
     Attributes:
         waits: The number of times that the processor waited for the device.
@@ -36,9 +61,7 @@ class Counts:
         copies: The number of copies and clears of buffers, which interrupt a pass.
         submissions: The number of submitted command buffers.
         uploaded, downloaded: Bytes copied to the device and from it.
-        groups: The number of dispatches with each bind group; None: they are not counted, since
-            that keeps the memory of their buffers.
-        copied, cleared: The bytes that copies read, and those that copies and clears write.
+        traffic: None: it is not counted, which takes time.
     """
 
     waits: int = 0
@@ -47,31 +70,23 @@ class Counts:
     submissions: int = 0
     uploaded: int = 0
     downloaded: int = 0
-    groups: Counter[BindGroup] | None = None
-    copied: Counter[str] = field(default_factory=Counter)
-    cleared: Counter[str] = field(default_factory=Counter)
+    traffic: Traffic | None = None
 
-    def traffic(self) -> tuple[Counter[str], Counter[str]]:
-        """The bytes of the device's memory that are read and written, by the names of buffers."""
-        read, written = Counter(self.copied), self.cleared.copy()
-        assert self.groups is not None
-        for group, times in self.groups.items():
-            for binding, buffer in group.buffers:
-                if binding.kind == "read_write":
-                    written[buffer.label] += times * buffer.size
-                if not binding.only_written:
-                    read[buffer.label] += times * buffer.size
-        return read, written
+    def use(self, name: str, size: int) -> None:
+        """Note how many bytes of a buffer the next kernels use."""
+        if self.traffic is not None:
+            self.traffic.used[name] = size
 
     def add_dispatch(self, group: BindGroup) -> None:
         """Count a kernel with its buffers."""
         self.dispatches += 1
-        if self.groups is not None:
-            self.groups[group] += 1
+        if self.traffic is not None:
+            self.traffic.add_kernel(group)
 
     def add_copy(self, source: Any, target: Any, size: int) -> None:
         """Count a copy; ``source`` is None if the buffer is cleared."""
         self.copies += 1
-        if source is not None:
-            self.copied[source.label] += size
-        self.cleared[target.label] += size
+        if self.traffic is not None:
+            self.traffic.written[target.label] += size
+            if source is not None:
+                self.traffic.read[source.label] += size

@@ -9,8 +9,8 @@ makes the arrays larger and records these steps again. So results do not depend 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Mapping
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,9 +39,10 @@ from pipeline.render.types import AdamRates
 IMAGE_CACHE = 2 << 30
 # The steps whose results are read at once at the latest, and the words of their results at least.
 MAX_RECORDED, RESULT_WORDS = 32, 1 << 16
-# The pairs for which there is room at least. The room of the next steps is ``ROOM`` times the
-# largest number of pairs if a step had less than ``LEAST_ROOM``.
-MIN_CAPACITY, LEAST_ROOM, ROOM = 1 << 16, 1.1, 1.3
+# The pairs for which there is room at least. Beyond it, the room is ``ROOM`` times the largest
+# number of pairs in ``RECENT_STEPS``; it stays while it is between the other two factors.
+MIN_CAPACITY, RECENT_STEPS = 1 << 16, 512
+LEAST_ROOM, ROOM, MOST_ROOM = 1.1, 1.3, 2.0
 
 
 @dataclass(frozen=True)
@@ -129,19 +130,23 @@ class GpuTraining(ResidentTraining):
         self._results: list[StepResult] = []
         self._dropped = 0  # The sum of the steps whose results have been read.
         self._capacity = 0  # The pairs for which the arrays of a step have room.
+        self._pairs: deque[int] = deque(maxlen=RECENT_STEPS)
 
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
 
     def load(self, optimised: Optimised) -> None:
         self._read_results()
-        parameters, count = optimised.parameters, len(optimised.last)
+        parameters, count, before = optimised.parameters, len(optimised.last), self.scene.count
         sh, geometry = parameters["sh"], layout.join(layout.GEOMETRY, parameters)
         self.scene = rasterise.Scene(
             count, sh.shape[1], self._fill("geometry", geometry), self._fill("sh", sh.numpy())
         )
         appearance = parameters.get("appearance")
-        self._capacity = max(self._capacity, MIN_CAPACITY, PAIRS_PER_GAUSSIAN * count)
+        if not self._pairs:
+            self._capacity = max(MIN_CAPACITY, PAIRS_PER_GAUSSIAN * count)
+        elif count > before:
+            self._set_capacity(max(self._pairs), self._capacity * count // before)
         self.embedding_size = 0 if appearance is None else appearance.shape[1]
         self.buffers = {
             name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
@@ -241,19 +246,26 @@ class GpuTraining(ResidentTraining):
                 self._dropped = found.dropped
                 if not found.stopped:
                     self._results.append(self._result(of_step, found, dropped, words))
-            self._make_room(max(totals, key=lambda each: each.pairs))
+            self._make_room(totals)
             stopped = [each for each in totals if each.stopped]
             if stopped:
                 self.gpu.clear(self.stopped)
                 for again in recorded[-len(stopped) :]:
                     self._record(again.step)
 
-    def _make_room(self, largest: Totals) -> None:
-        """Give the next steps room for more pairs if a step has used most of it."""
-        if LEAST_ROOM * largest.pairs > self._capacity:
-            largest.require_listable()
-            limit = min(rasterise.MAX_INTERSECTIONS, self.gpu.max_bytes // layout.SLOT_BYTES)
-            self._capacity = max(largest.pairs, min(limit, int(ROOM * largest.pairs)))
+    def _make_room(self, totals: Sequence[Totals]) -> None:
+        """Give the next steps room by the pairs of the last ones."""
+        self._pairs.extend(each.pairs for each in totals)
+        most = max(self._pairs)
+        if LEAST_ROOM * most <= self._capacity <= max(MIN_CAPACITY, MOST_ROOM * most):
+            return
+        max(totals, key=lambda each: each.pairs).require_listable()
+        self._set_capacity(most, int(ROOM * most))
+
+    def _set_capacity(self, least: int, wanted: int) -> None:
+        """Set the room to ``wanted`` pairs, or to fewer if buffers cannot be so large."""
+        limit = min(rasterise.MAX_INTERSECTIONS, self.gpu.max_bytes // layout.SLOT_BYTES)
+        self._capacity = max(MIN_CAPACITY, least, min(limit, wanted))
 
     def _result(
         self, recorded: _Recorded, totals: Totals, dropped: int, words: NDArray[np.uint32]

@@ -26,6 +26,7 @@ class Workspace:
 
     def get(self, name: str, size: int) -> Buffer:
         """The buffer of this name, with at least ``size`` bytes."""
+        self.gpu.counts.use(name, size)
         found = self._buffers.get(name)
         if found is None or found.size < size:
             grown = size if found is None else min(int(GROWTH * size), self.gpu.max_bytes)

@@ -18,6 +18,7 @@ from pipeline.render import (
 )
 from pipeline.render.gpu.counts import Counts
 from pipeline.render.resident import Optimised, Planes, ResidentImage, ResidentStep
+from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.appearance.embedding import appearance_gradients, colour_offsets
 from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep, Rates
@@ -238,6 +239,22 @@ def test_results_do_not_depend_on_the_room_for_pairs(
                     assert torch.equal(value, getattr(two.camera, part)), f"{name}: {part}"
         for key, tensor in tensors.items():
             assert torch.equal(tensor, changed[key]), f"{name}: {key}"
+
+
+def test_room_is_no_larger_than_the_buffers_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The room that a scene may need at most would exceed them; the pairs that it has fit."""
+    need_gpu()
+    training, state = make_backend("gpu").resident(), State()
+    assert training is not None
+    monkeypatch.setattr(training.gpu, "max_bytes", 300_000)
+    training.load(state.optimised)
+    training.step(replace(STEP, adam=state.adam.rates(adam_step(1))))
+    assert training.results()[0].num_visible > 100
+    with pytest.raises(UserError, match=r"derivatives of SSIM: .* holds 0 MB"):
+        target = pixels(90, 120, 3)
+        image = replace(IMAGE, key=None, target=target)
+        step = replace(STEP, image=image, camera=camera(120, 90))
+        training.step(replace(step, adam=state.adam.rates(adam_step(2))))
 
 
 def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -144,7 +144,7 @@ class GpuTraining(ResidentTraining):
         )
         appearance = parameters.get("appearance")
         if not self._pairs:
-            self._capacity = max(MIN_CAPACITY, PAIRS_PER_GAUSSIAN * count)
+            self._set_capacity(0, PAIRS_PER_GAUSSIAN * count)
         elif count > before:
             self._set_capacity(max(self._pairs), self._capacity * count // before)
         self.embedding_size = 0 if appearance is None else appearance.shape[1]
@@ -263,9 +263,10 @@ class GpuTraining(ResidentTraining):
         self._set_capacity(most, int(ROOM * most))
 
     def _set_capacity(self, least: int, wanted: int) -> None:
-        """Set the room to ``wanted`` pairs, or to fewer if buffers cannot be so large."""
+        """Set the room to ``wanted`` pairs, or to fewer, but not less than ``least``, if buffers
+        cannot be so large."""
         limit = min(rasterise.MAX_INTERSECTIONS, self.gpu.max_bytes // layout.SLOT_BYTES)
-        self._capacity = max(MIN_CAPACITY, least, min(limit, wanted))
+        self._capacity = max(least, min(limit, max(MIN_CAPACITY, wanted)))
 
     def _result(
         self, recorded: _Recorded, totals: Totals, dropped: int, words: NDArray[np.uint32]

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from benchmarks import markdown
+from benchmarks import gpu_model, markdown
 from benchmarks.budgets import tables as budget_tables
 from benchmarks.card import result as card
 from benchmarks.judge.truth import Grade
@@ -22,6 +22,7 @@ from benchmarks.results import (
     BudgetResult,
     FileResult,
     GeoreferenceResult,
+    GpuCountsResult,
     GrowthResult,
     JudgeResult,
     LevelResult,
@@ -309,6 +310,8 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
 #: Kind of table -> the type of the results in its records, and the function that makes the table.
 TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "card": (card.CardResult, card.table),
+    "gpu_counts": (GpuCountsResult, gpu_model.counts_table),
+    "gpu_model": (GpuCountsResult, gpu_model.model_table),
     "memory": (MemoryResult, memory),
     "sfm": (summary.Run, lambda found: summary.table(summary.summaries(found))),
     "sfm.growth": (GrowthResult, growth),

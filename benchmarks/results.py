@@ -244,6 +244,39 @@ class GpuResult:
     moments_bandwidth: float
 
 
+# ---- benchmarks.gpu_counts ----
+
+
+@dataclass(frozen=True)
+class GpuCountsResult:
+    """The work of a training step on a GPU.
+
+    Attributes:
+        pairs: The number of (Gaussian, tile) pairs.
+        steps: The number of steps that were counted.
+        waits: The number of times that the processor waited for the device in all of them.
+        dispatches, copies, submissions: Of kernels, of copies and clears of buffers, and of command
+            buffers, in a step.
+        uploaded_mb: Copied to the device in a step.
+        memory_mb: The bytes in use of each buffer, read and written once by each kernel that is
+            bound to it, in a step.
+        gflop: The arithmetic of a step if no pixel is done before the last Gaussian.
+    """
+
+    gaussians: int
+    width: int
+    height: int
+    pairs: int
+    steps: int
+    waits: int
+    dispatches: float
+    copies: float
+    submissions: float
+    uploaded_mb: float
+    memory_mb: dict[str, float]
+    gflop: float
+
+
 # ---- benchmarks.blocks ----
 
 

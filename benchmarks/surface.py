@@ -94,11 +94,10 @@ def prepare(name: str, setup: Setup, folder: Path, seed: int) -> Scene:
     """Train the scene and estimate its depths."""
     photographs = write_scene(name, setup, seed)
     scene = read_scene(photographs)
-    options, threads = setup.options(), usable_cores()
-    # As the pipeline chooses where photographs show sky, which is not a surface.
+    # The pipeline chooses these, too: a skybox if photographs show sky.
     background: Background = "skybox" if name == "town" else "black"
-    if name == "town":
-        options = options.model_copy(update={"background": background})
+    options = setup.options().model_copy(update={"background": background})
+    threads = usable_cores()
     training = [view for view in scene.views if not view.is_test]
     start = time.perf_counter()
     run = TrainingRun(options, folder / "training", seed=seed, threads=threads)

@@ -3,7 +3,8 @@
     python -m benchmarks.card PACK --json record.json
 
 ``PACK`` is a folder of ``benchmarks.card.pack``. Its wheels and Vulkan loader are installed into a
-folder beside it, not into the system. Nothing here imports them before.
+folder inside it, not into the system. This module needs none of them: it installs them, and then
+runs itself in an environment that has them.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def measure_evidence(
     """
     chosen = evenly_spaced(views, MAX_PICTURES)
     pictures = [_picture(view) for view in chosen]
-    xyz = xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
+    xyz = _thinned(xyz)
     borders, excluded = zip(*map(_border, pictures), strict=True)
     fixed, colour = _fixed(np.stack(borders))
     axes = np.stack([view.world_to_camera[2, :3] for view in chosen])
@@ -122,17 +122,22 @@ class SkyMasks:
     """
 
     def __init__(self, views: Sequence[View], xyz: NDArray[np.float64], up: NDArray[np.float64]):
-        xyz = xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
+        xyz = _thinned(xyz)
         found = {}
         for view in views:
             picture = _picture(view)
-            found[view.name] = _to_the_edge(picture.rgb, sky_pixels(picture, xyz, up))
-        count = sum(bool(mask.any()) for mask in found.values())
-        enough = count >= max(MIN_SKY, SKY_SHARE * len(views))
+            sky = sky_pixels(picture, xyz, up)
+            if sky.any():
+                found[view.name] = _to_the_edge(picture.rgb, sky)
+        enough = len(found) >= max(MIN_SKY, SKY_SHARE * len(views))
         self._found = found if enough else {}
 
+    def __len__(self) -> int:
+        """The number of photographs that show sky."""
+        return len(self._found)
+
     def of(self, view: View) -> NDArray[np.bool_]:
-        """(H, W) bool, to a pixel of the reduced photograph."""
+        """Whether each pixel (H, W) is sky. Borders are those of the reduced photograph."""
         if view.name not in self._found:
             return np.zeros((view.height, view.width), bool)
         mask = self._found[view.name].astype(np.uint8)
@@ -167,6 +172,11 @@ def choose_background(evidence: Evidence) -> SceneBackground:
         background="fill",
         reason=f"a fill behind the scene, in the colours of the nearest points: {sky}",
     )
+
+
+def _thinned(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """At most ``MAX_POINTS`` of the points (P, 3)."""
+    return xyz[:: math.ceil(len(xyz) / MAX_POINTS) or 1]
 
 
 def _picture(view: View) -> Picture:
@@ -208,8 +218,8 @@ def sky_pixels(
 
 
 def _to_the_edge(rgb: NDArray[np.float32], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The sky with the pixels beside it that have its colour there: points on the silhouettes of
-    buildings hid them."""
+    """The sky, and the pixels beside it of its colour there: ``sky_pixels`` leaves them out, since
+    points on the silhouettes of buildings are near."""
     side = (2 * (POINT_DISTANCE + 1) + 1,) * 2
     share = cv2.blur(sky.astype(np.float32), side)
     nearby = cv2.blur(rgb * sky[..., None], side) / np.maximum(share, 1e-6)[..., None]

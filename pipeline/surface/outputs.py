@@ -41,8 +41,8 @@ class Observed:
         gains: Their exposures.
         dense: The folder of the dense stage; None if it did not run.
         dense_unit: The length of the dense stage's unit in the unit of the Gaussians.
-        points: (P, 3) the sparse points in the world of the views, which tell sky from smooth
-            surfaces; None: nothing is sky.
+        points: (P, 3) the sparse points in the world of the views. They and multi-view stereo tell
+            sky from smooth surfaces; without one of them, nothing is sky.
     """
 
     gains: ExposureGains = NO_GAINS
@@ -99,11 +99,7 @@ def write_rendered(
             if "depths" in formats:
                 write_depths(out / "depths", renders)
             if "mesh" in formats:
-                sky = None
-                if observed.points is not None:
-                    sky = SkyMasks(
-                        [view for view in views if not view.is_test], observed.points, up
-                    )
+                sky = _sky(observed, views, up, messages)
                 maps = DepthMaps(renders, observed.dense, observed.dense_unit, sky)
                 made = make_mesh(
                     maps, config.mesh_voxel, config.mesh_faces, options.threads, messages
@@ -119,6 +115,22 @@ def write_rendered(
     if "video" in formats:
         _write_video(out, config.video, gaussians, views, options, up, origin, messages)
     return messages
+
+
+def _sky(
+    observed: Observed, views: list[View], up: NDArray[np.float64], messages: Messages
+) -> SkyMasks | None:
+    """The sky of the training views, of which the user is told."""
+    if observed.points is None or observed.dense is None:
+        return None
+    training = [view for view in views if not view.is_test]
+    sky = SkyMasks(training, observed.points, up)
+    if len(sky):
+        messages.decisions.append(
+            f"mesh: what looks like sky in {len(sky)} of {len(training)} photographs, and matches "
+            "in none of the others, is left out"
+        )
+    return sky
 
 
 def _write_video(

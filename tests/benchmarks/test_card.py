@@ -62,7 +62,7 @@ def test_a_pack_that_is_too_large_is_an_error(tmp_path: Path, monkeypatch) -> No
 
 def test_a_reduced_measurement_has_every_part(tmp_path: Path, monkeypatch) -> None:
     """On a device in software if there is one; without one, the processor alone is measured."""
-    # Not in processes of their own: each would load torch again.
+    # The parts run in this process, since each process of their own would load torch again.
     monkeypatch.setattr(run, "run_limited", lambda limits, function, case: function(case))
     world = tmp_path / "world"
     write_demo(world, DemoSpec(views=10, width=96, height=64, distortion="none", poses="colmap"), 1)

@@ -18,6 +18,7 @@ from benchmarks.results import (
     BudgetResult,
     FileResult,
     GeoreferenceResult,
+    GpuCountsResult,
     GrowthResult,
     JudgeResult,
     LevelResult,
@@ -36,6 +37,11 @@ from benchmarks.tables import KINDS, MARKER, RECORDS, pages, rewritten
 from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
 
+GPU_COUNTS = GpuCountsResult(
+    *(200_000, 960, 540, 447_000, 4, 1, 74.0, 0.0, 1.0, 0.1),
+    memory_mb={"sh": 500.0, "records": 270.0},
+    gflop=3.0,
+)
 EXAMPLES: dict[str, tuple[Any, str]] = {
     "files": (
         FileResult(
@@ -77,6 +83,14 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
         ),
         "| fox | 7, 450x800 | 4 | 1 | 30.13 | 0.951 | 0.200 | 150k | 9000 | 4.1, 7.9 | "
         "1.2 | 2 | 1.9 |",
+    ),
+    "gpu_counts": (
+        GPU_COUNTS,
+        "| 200k, 960x540 | 447,000 | 1 in 4 steps | 74 | 0 | 770 | 3.0 |",
+    ),
+    "gpu_model": (
+        GPU_COUNTS,
+        "| M2, 10 cores, 100 GB/s, 4 TFLOP/s | 200k, 960x540 | 7.7 | 0.8 | 0.3 | 8.8 |",
     ),
     "card": (
         CardResult("step", "5 Gaussians, 96x64", "measured", "", 3.6, {"step_ms": 2.25}),

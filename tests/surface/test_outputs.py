@@ -22,7 +22,7 @@ from pipeline.render.views import render_rgb
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
-from pipeline.surface.outputs import write_rendered
+from pipeline.surface.outputs import Observed, write_rendered
 from tests.surface.scenes import view_at
 from tests.surface.test_files import read_glb
 
@@ -250,3 +250,18 @@ def test_sky_has_no_surface_unless_photographs_match_there(tmp_path, ball, views
             assert np.array_equal(found.depth[40:], expected[found.view.name].depth[40:])
     (first, *_) = DepthMaps(renders, sky=_UpperHalf())
     assert np.isinf(first.depth[:40]).all() and not np.isinf(first.depth[40:]).any()
+
+
+@pytest.mark.parametrize("is_dense", [True, False])
+def test_the_user_is_told_that_sky_is_left_out(tmp_path, ball, views, is_dense):
+    """The photographs are grey, without a point. Stereo matches nothing; without it, a smooth wall
+    could be cut away, so that nothing counts as sky."""
+    nothing = DenseMap(np.zeros((80, 80), np.float32), np.zeros((80, 80, 3)), np.zeros((80, 80)))
+    for view in views:
+        write_map(tmp_path, view.name, nothing)
+    observed = Observed(dense=tmp_path if is_dense else None, points=np.zeros((0, 3)))
+    config = Export(formats=("mesh",), mesh_voxel=0.05)
+    messages = write_rendered(
+        tmp_path / "out", config, ball, views, look(views), up=UP, observed=observed
+    )
+    assert any("looks like sky" in text for text in messages.decisions) == is_dense

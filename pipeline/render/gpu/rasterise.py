@@ -74,11 +74,11 @@ class Visible:
     """The visible Gaussians, front to back, and the ranges of their pairs.
 
     Attributes:
-        gaussians: The Gaussians.
+        gaussians: The visible Gaussians, front to back.
         count: One uint32, the number of visible Gaussians.
-        first: (N + 1,), the first pair of each rank; from the number of visible Gaussians on, the
-            number of all pairs.
-        ranges: See ``Lists``; empty.
+        first: (N + 1,) uint32, the number of the first pair of each visible Gaussian; after these,
+            the number of all pairs.
+        ranges: The buffer of ``Lists.ranges``, whose ranges are still empty.
     """
 
     projection: Projection

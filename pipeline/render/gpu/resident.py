@@ -146,7 +146,7 @@ class GpuTraining(ResidentTraining):
         if not self._pairs:
             self._set_capacity(0, PAIRS_PER_GAUSSIAN * count)
         elif count > before:
-            self._set_capacity(max(self._pairs), self._capacity * count // before)
+            self._set_capacity(max(self._pairs), self._capacity * count // max(before, 1))
         self.embedding_size = 0 if appearance is None else appearance.shape[1]
         self.buffers = {
             name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()

@@ -12,7 +12,7 @@ from pipeline.render.gpu import device, kernels, rasterise
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.device import Gpu
 from pipeline.render.gpu.memory import memory_line, training_bytes
-from pipeline.render.gpu.primitives import scan, sort
+from pipeline.render.gpu.primitives import sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import TrainingSize
 from pipeline.runtime.errors import UserError
@@ -95,59 +95,30 @@ def test_a_lost_device_is_an_error(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) ->
     assert "resumes from its checkpoint" in str(error.value.fix)
 
 
-@pytest.mark.parametrize("count", [1, 5, 255, 1024, 1025, 70_000, 1_100_000])
-def test_prefix_sums(gpu: Gpu, count: int) -> None:
-    values = np.random.default_rng(count).integers(0, 9, count).astype(np.uint32)
-    buffer = gpu.upload(values)
-    scan(Workspace(gpu), buffer, count)
-    expected = np.cumsum(values) - values
-    assert (gpu.read(buffer, np.uint32, count) == expected).all()
-
-
-@pytest.mark.parametrize(
-    ("length", "capacity", "bits"),
-    [(0, 4, 32), (1, 1, 4), (1000, 1024, 13), (5000, 9000, 32), (70_000, 70_000, 9)],
-)
-def test_sorting_is_stable(gpu: Gpu, length: int, capacity: int, bits: int) -> None:
-    rng = np.random.default_rng(length)
-    keys = rng.integers(0, 1 << bits, capacity, dtype=np.uint64).astype(np.uint32)
-    keys[::3] = keys[0]  # equal keys
-    values = np.arange(capacity, dtype=np.uint32)
-    size = gpu.upload(np.array([length], np.uint32))
-    buffers = gpu.upload(keys), gpu.upload(values), size
-    found = sort(Workspace(gpu), *buffers, capacity=capacity, bits=bits)
-    order = np.argsort(keys[:length], kind="stable")
-    assert (gpu.read(found[0], np.uint32, length) == keys[order]).all()
-    assert (gpu.read(found[1], np.uint32, length) == order).all()
-
-
 def test_a_workspace_keeps_what_recorded_kernels_read(gpu: Gpu) -> None:
     """A uniform that changes before its kernel is submitted, and a buffer that grows between two
     uses of the same kernel."""
     space = Workspace(gpu)
-    values = np.arange(2000, dtype=np.uint32)
-    for count in (3, 2000, 7):
+    values = np.arange(1000, dtype=np.float32)
+    for count in (3, 1000, 7):
         buffer = space.get("values", 4 * count)
         gpu.write(buffer, values[:count])
-        sums = space.get("sums", 64)
-        for part in (count // 2, count):
-            size = space.uniform("size", "I", part)
-            space.run("scan.blocks", 1, size=size, values=buffer, sums=sums)
-        half = count // 2
-        once = np.concatenate([np.cumsum(values[:half]) - values[:half], values[half:count]])
-        part = min(count, 1024)
-        expected = once.astype(np.uint32)
-        expected[:part] = np.cumsum(once[:part]) - once[:part]
-        assert (gpu.read(buffer, np.uint32, count) == expected).all(), count
+        sums, parts = space.get("sums", 64), (count // 2, count)
+        for at, part in enumerate(parts):
+            size = space.uniform("size", "III", part, 1, at)
+            space.run("sum_rows", 1, size=size, values=buffer, sums=sums)
+        expected = [values[:part].sum() for part in parts]
+        assert gpu.read(sums, np.float32, 2).tolist() == expected, count
 
 
 def test_kernels_are_timed_one_by_one(gpu: Gpu) -> None:
     with profiled(gpu) as profile:
         for _ in range(3):
-            scan(Workspace(gpu), gpu.upload(np.ones(5000, np.uint32)), 5000)
+            keys, length = gpu.upload(np.ones(5000, np.uint32)), gpu.uniform("I", 5000)
+            sort(Workspace(gpu), "test", keys, length, capacity=5000, bits=8)
             profile.collect()
-    assert set(profile.seconds) == {"scan.blocks", "scan.add"}
-    assert 0 < profile.seconds["scan.blocks"] < 10
+    assert set(profile.seconds) == {"sort.histogram", "scan", "sort.scatter"}
+    assert 0 < profile.seconds["scan"] < 10
     assert gpu.timer is None
 
 

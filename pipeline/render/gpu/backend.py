@@ -107,21 +107,22 @@ class GpuBackend(Backend[Projected, Binned]):
         view = layout.pack_view(projected.camera, options, count, whole.scene.coefficients)
         radii = torch.where(subset.which, projected.radii, 0.0)
         tiles = gpu.read(whole.tile_counts, np.uint32, count) * subset.which.numpy()
+        depths = gpu.read(whole.depths, np.uint32, count) * subset.which.numpy()
         projection = replace(
             whole,
             view=gpu.upload(view),
             radii=gpu.upload(radii.numpy()),
             tile_counts=gpu.upload(tiles.astype(np.uint32)),
-            visible=gpu.upload((radii > 0).numpy().astype(np.uint32)),
+            depths=gpu.upload(depths.astype(np.uint32)),
         )
         return replace(projected, options=options, projection=projection, radii=radii)
 
     def bin(self, projected: Projected) -> Binned:
         gpu, projection = self.gpu, projected.projection
         size = 4 * projection.scene.count
-        visible = gpu.empty(size)  # ``list_pairs`` overwrites it.
-        gpu.copy(projection.visible, 0, visible, 0, size)
-        lists, totals = rasterise.list_pairs(Workspace(gpu), replace(projection, visible=visible))
+        depths = gpu.empty(size)  # ``list_pairs`` overwrites it.
+        gpu.copy(projection.depths, 0, depths, 0, size)
+        lists, totals = rasterise.list_pairs(Workspace(gpu), replace(projection, depths=depths))
         return Binned(projected, lists, totals)
 
     def blend(self, binned: Binned) -> Forward:

@@ -28,7 +28,8 @@ NEEDED = {
     "max-compute-workgroup-storage-size": 24 * 1024,
     "max-storage-buffers-per-shader-stage": 12,
 }
-OPTIONAL_FEATURES = ("timestamp-query",)
+SUBGROUPS = "subgroup"  # The feature with which prefix sums are faster.
+OPTIONAL_FEATURES = ("timestamp-query", SUBGROUPS)
 # Limits that are requested as far as the device has them: the size of a scene depends on them.
 WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
 
@@ -96,14 +97,20 @@ class Gpu:
 
     Kernels are named as their WGSL files; ``name.entry`` is another entry point than ``main``.
 
+    Args:
+        number: The N of ``gpu:N``.
+        subgroups: Whether kernels use subgroups if the device has them. Results do not depend on
+            it.
+
     Attributes:
+        subgroups: Whether kernels use subgroups.
         counts: The work since the device was opened, or since a caller replaced the counts.
 
     Raises:
         UserError: there is no such device, or it lacks what the kernels need.
     """
 
-    def __init__(self, number: int = 0):
+    def __init__(self, number: int = 0, *, subgroups: bool = True):
         found = _adapters()
         if number >= len(found):
             raise UserError(f"no GPU {number}: {len(found)} found", fix=NO_GPU)
@@ -121,6 +128,7 @@ class Gpu:
         self.device = adapter.request_device_sync(
             required_limits=requested, required_features=features
         )
+        self.subgroups = subgroups and SUBGROUPS in features
         self.max_bytes = min(limits[name] for name in WANTED)
         self._pipelines: dict[str, tuple[Any, Any]] = {}
         self._layouts: dict[str, tuple[Any, Any]] = {}
@@ -316,7 +324,8 @@ class Gpu:
             }
             for binding in source(name).bindings
         ]
-        module = self.device.create_shader_module(label=name, code=source(name).code)
+        code = source(name, self.subgroups).code
+        module = self.device.create_shader_module(label=name, code=code)
         return self.device.create_bind_group_layout(entries=entries), module
 
 

@@ -51,9 +51,14 @@ class Source:
 
 
 @cache
-def source(name: str) -> Source:
-    """The module ``wgsl/name.wgsl`` with its imports and the constants."""
-    text = constants() + _with_imports((FOLDER / f"{name}.wgsl").read_text("utf-8"), {name})
+def source(name: str, subgroups: bool = False) -> Source:
+    """The module ``wgsl/name.wgsl`` with its imports and the constants.
+
+    Args:
+        subgroups: Whether ``prefix_subgroups.wgsl`` replaces ``prefix.wgsl``.
+    """
+    text = (FOLDER / f"{name}.wgsl").read_text("utf-8")
+    text = constants() + _with_imports(text, {name}, subgroups)
     bindings = tuple(
         Binding(
             int(m["number"]),
@@ -85,12 +90,13 @@ def constants() -> str:
     return "".join(lines)
 
 
-def _with_imports(text: str, seen: set[str]) -> str:
+def _with_imports(text: str, seen: set[str], subgroups: bool) -> str:
     def replacement(match: re.Match[str]) -> str:
         name = match[1]
         if name in seen:
             return ""
         seen.add(name)
-        return _with_imports((FOLDER / f"{name}.wgsl").read_text("utf-8"), seen)
+        file = "prefix_subgroups" if subgroups and name == "prefix" else name
+        return _with_imports((FOLDER / f"{file}.wgsl").read_text("utf-8"), seen, subgroups)
 
     return _IMPORT.sub(replacement, text)

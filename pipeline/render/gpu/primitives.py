@@ -2,59 +2,84 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render.gpu.device import Buffer, blocks
 from pipeline.render.gpu.workspace import Workspace
 
-# The numbers of a workgroup in scan.wgsl and sort.wgsl, and its rows in sum_rows.wgsl.
-BLOCK = 1024
-DIGIT_BITS = 4  # The bits of a pass of sort.wgsl.
+ROWS = 1024  # The rows of a workgroup in sum_rows.wgsl.
+BLOCK = 2048  # kBlock in block.wgsl
+DIGIT_BITS, DIGITS = 8, 256  # Of a pass of sort.wgsl.
 
 
-def scan(space: Workspace, values: Buffer, count: int, level: int = 0) -> None:
-    """Replace ``count`` uint32 by their exclusive prefix sums."""
-    groups = blocks(count, BLOCK)
-    sums = space.get(f"scan sums {level}", 4 * groups)
-    arguments = {"size": space.gpu.uniform("I", count), "values": values, "sums": sums}
-    space.run("scan.blocks", groups, **arguments)
-    if groups > 1:
-        scan(space, sums, groups, level + 1)
-        space.run("scan.add", groups, **arguments)
+@dataclass(frozen=True)
+class Sorted:
+    """Sorted keys.
+
+    Attributes:
+        keys: (count,) uint32, the keys in ascending order.
+        order: (count,) uint32, the index of each of them before sorting.
+        count: One uint32, the number of keys that are not zero.
+    """
+
+    keys: Buffer
+    order: Buffer
+    count: Buffer
+
+
+def scan(
+    space: Workspace, values: Buffer, rows: int, length: Buffer, stride: int, totals: Buffer
+) -> None:
+    """Replace the rows of a table of uint32 by their exclusive prefix sums.
+
+    Args:
+        length: One uint32, the length of an array. Each row has an element for each ``BLOCK`` of
+            its elements.
+        stride: The distance between the starts of two rows.
+        totals: (rows,) uint32, becomes the sums of the rows.
+    """
+    size = space.gpu.uniform("I", stride)
+    space.run("scan", rows, size=size, length=length, values=values, totals=totals)
 
 
 def sort(
-    space: Workspace, keys: Buffer, values: Buffer, length: Buffer, *, capacity: int, bits: int
-) -> tuple[Buffer, Buffer]:
-    """Sort uint32 values by the lowest ``bits`` of their keys; equal keys keep their order.
+    space: Workspace, name: str, keys: Buffer, length: Buffer, *, capacity: int, bits: int
+) -> Sorted:
+    """Sort the indices of uint32 keys of at most ``bits`` bits by their keys. Keys of zero are left
+    out; equal keys keep their order.
 
     Args:
+        name: The name of the keys. The result's order and number are valid until the next sort of
+            this name, its keys until the next sort.
+        keys: They are overwritten.
         length: One uint32, the number of keys, which is at most ``capacity``.
-
-    Returns:
-        The sorted keys and values: the buffers of the input or of the workspace. The other ones are
-        overwritten.
     """
-    groups = blocks(capacity, BLOCK)
-    places = space.get("sort places", 4 * 16 * groups)
-    others = space.get("sort keys", 4 * capacity), space.get("sort values", 4 * capacity)
-    here = keys, values
-    for shift in range(0, bits, DIGIT_BITS):
+    groups, size = max(1, blocks(capacity, BLOCK)), 4 * capacity
+    places, totals = space.get("places of digits", 4 * DIGITS * groups), space.get("digits", 1024)
+    count = space.get(f"number of {name}", 4)
+    other_keys = space.get("sort keys", size)
+    order, other_order = space.get(f"order of {name}", size), space.get("sort order", size)
+    passes = blocks(bits, DIGIT_BITS)
+    if passes % 2 == 0:  # The last pass writes to the order of this name.
+        order, other_order = other_order, order
+    for each in range(passes):
         arguments = {
-            "pass_": space.gpu.uniform("II", shift, groups),
-            "length": length,
-            "keys": here[0],
-            "values": here[1],
+            "pass_": space.gpu.uniform("II", DIGIT_BITS * each, groups),
+            "length": count if each else length,
+            "keys": keys,
             "places": places,
-            "sorted_keys": others[0],
-            "sorted_values": others[1],
         }
         space.run("sort.histogram", groups, **arguments)
-        scan(space, places, 16 * groups)
+        scan(space, places, DIGITS, arguments["length"], groups, totals)
+        arguments |= {"totals": totals, "sorted_keys": other_keys, "sorted_order": order}
+        arguments |= {"order": other_order} if each else {"count": count}
         space.run("sort.scatter", groups, **arguments)
-        here, others = others, here
-    return here
+        keys, other_keys = other_keys, keys
+        order, other_order = other_order, order
+    return Sorted(keys, other_order, count)
 
 
 def sum_rows(space: Workspace, rows: Buffer, count: int, width: int) -> NDArray[np.float64]:
@@ -67,15 +92,15 @@ def sum_rows(space: Workspace, rows: Buffer, count: int, width: int) -> NDArray[
 
 def partial_sums(count: int, width: int) -> int:
     """The number of float32 that ``sum_blocks`` writes."""
-    return width * blocks(count, BLOCK)
+    return width * blocks(count, ROWS)
 
 
 def sum_blocks(
     space: Workspace, rows: Buffer, count: int, width: int, sums: Buffer, at: int = 0
 ) -> None:
-    """Write the sums of blocks of ``BLOCK`` rows of ``width`` float32, from element ``at`` on."""
+    """Write the sums of blocks of ``ROWS`` rows of ``width`` float32, from element ``at`` on."""
     size = space.gpu.uniform("III", count, width, at)
-    space.run("sum_rows", blocks(count, BLOCK), size=size, values=rows, sums=sums)
+    space.run("sum_rows", blocks(count, ROWS), size=size, values=rows, sums=sums)
 
 
 def add_partial_sums(sums: NDArray[np.float32], width: int) -> NDArray[np.float64]:

@@ -13,14 +13,14 @@ from torch import Tensor
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.adam import uniform
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
-from pipeline.render.gpu.primitives import scan, sort
+from pipeline.render.gpu.primitives import BLOCK, sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AdamRates, CameraGradients
 from pipeline.runtime.errors import UserError
 
 # Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
 MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
-DEPTH_BITS = 32
+DEPTH_BITS = 31  # Depths are positive float32.
 TOTALS = 4  # The words of ``Totals``.
 NO_RATES = AdamRates((0.0, 0.0), 1)
 # The tiles of one dispatch: an image of 1024 x 1024 pixels.
@@ -54,7 +54,7 @@ class Projection:
         records, boxes: ``Record`` and ``Box`` of the visible Gaussians.
         radii: See ``Forward.radii``.
         tile_counts: The number of tiles of each Gaussian.
-        visible: 1 for visible Gaussians, 0 for others, until ``sort_visible``.
+        depths: The bits of the depths of visible Gaussians, 0 for others, until ``sort_visible``.
         dropped: One uint32, the sum of ``Forward.num_dropped`` since the buffer was made.
     """
 
@@ -65,7 +65,7 @@ class Projection:
     boxes: Buffer
     radii: Buffer
     tile_counts: Buffer
-    visible: Buffer
+    depths: Buffer
     dropped: Buffer
 
 
@@ -76,8 +76,9 @@ class Visible:
     Attributes:
         gaussians: The visible Gaussians, front to back.
         count: One uint32, the number of visible Gaussians.
-        first: (N + 1,) uint32, the number of the first pair of each visible Gaussian; after these,
-            the number of all pairs.
+        first: The number of the first pair of each visible Gaussian, in its block of ``BLOCK``
+            visible Gaussians.
+        before: The number of pairs of each block; from ``admit`` on, of all blocks before it.
         ranges: The buffer of ``Lists.ranges``, whose ranges are still empty.
     """
 
@@ -85,6 +86,7 @@ class Visible:
     gaussians: Buffer
     count: Buffer
     first: Buffer
+    before: Buffer
     ranges: Buffer
 
 
@@ -181,7 +183,7 @@ def project(space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int])
         "boxes": space.get("boxes", layout.BOX_BYTES * count),
         "radii": space.get("radii", 4 * count),
         "tile_counts": space.get("tile counts", 4 * count),
-        "visible": space.get("visible", 4 * count),
+        "depths": space.get("depths", 4 * count),
         "dropped": space.get("dropped", 4),
     }
     space.run("project", blocks(count), view=view, geometry=scene.geometry, sh=scene.sh, **arrays)
@@ -190,45 +192,33 @@ def project(space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int])
 
 def sort_visible(space: Workspace, projection: Projection) -> Visible:
     """Sort the visible Gaussians by depth and count their pairs. Overwrites
-    ``projection.visible``."""
+    ``projection.depths``."""
     gpu, p, count = space.gpu, projection, projection.scene.count
-    scan(space, p.visible, count)
-    depths, gaussians = space.get("depths", 4 * count), space.get("visible Gaussians", 4 * count)
-    num_visible = space.get("number of visible Gaussians", 4)
-    space.run(
-        "compact",
-        blocks(count),
-        size=gpu.uniform("I", count),
-        records=p.records,
-        radii=p.radii,
-        places=p.visible,
-        depths=depths,
-        gaussians=gaussians,
-        length=num_visible,
-    )
-    _, ordered = sort(space, depths, gaussians, num_visible, capacity=count, bits=DEPTH_BITS)
+    length = gpu.uniform("I", count)
+    visible = sort(space, "visible Gaussians", p.depths, length, capacity=count, bits=DEPTH_BITS)
     tiles = math.prod(layout.tiles_of(*p.size))
-    ranges = space.get("tile ranges", 8 * tiles)
-    # One more than the Gaussians: the last prefix sum is the number of pairs.
-    first = space.get("first pairs", 4 * (count + 1))
+    arrays = {
+        "first": space.get("first pairs", 4 * count),
+        "sums": space.get("pairs of blocks", 4 * blocks(count, BLOCK)),
+        "ranges": space.get("tile ranges", 8 * tiles),
+    }
     space.run(
         "order",
-        blocks(max(count + 1, tiles)),
-        size=gpu.uniform("II", count + 1, tiles),
-        length=num_visible,
-        gaussians=ordered,
+        blocks(max(count, tiles), BLOCK),
+        size=gpu.uniform("I", tiles),
+        length=visible.count,
+        gaussians=visible.order,
         tile_counts=p.tile_counts,
-        ordered=first,
-        ranges=ranges,
+        **arrays,
     )
-    scan(space, first, count + 1)
-    return Visible(p, ordered, num_visible, first, ranges)
+    return Visible(p, visible.order, visible.count, *arrays.values())
 
 
 def admit(
     space: Workspace, visible: Visible, capacity: int, stopped: Buffer, results: Buffer, at: int = 0
 ) -> Buffer:
-    """Decide on the device whether a step of these Gaussians is made (admit.wgsl).
+    """Number the pairs, and decide on the device whether a step of these Gaussians is made
+    (admit.wgsl).
 
     Args:
         capacity: The number of pairs that the arrays of the step hold.
@@ -238,14 +228,13 @@ def admit(
     Returns:
         One uint32, the number of pairs to list: none if the step is not made.
     """
-    length = space.get("number of pairs", 4)
-    count = visible.projection.scene.count
+    length = space.get("number of listed pairs", 4)
     space.run(
         "admit",
         1,
-        size=space.gpu.uniform("III", count, capacity, at),
+        size=space.gpu.uniform("II", capacity, at),
         num_visible=visible.count,
-        first=visible.first,
+        values=visible.before,
         dropped=visible.projection.dropped,
         stopped=stopped,
         length=length,
@@ -263,37 +252,34 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
     """
     p, gpu = visible.projection, space.gpu
     count, (tiles_x, tiles_y) = p.scene.count, layout.tiles_of(*p.size)
-    tiles = tiles_x * tiles_y
-    tile_of, numbers = space.get("tiles of pairs", 4 * capacity), space.get("pairs", 4 * capacity)
+    keys = space.get("tiles of pairs", 4 * capacity)
     gaussian_of = space.get("Gaussians of pairs", 4 * capacity)
     slots = space.get("slots of Gaussians", 4 * count)
     space.run(
         "pairs",
         blocks(count),
-        size=gpu.uniform("IIII", count, tiles, tiles_x, capacity),
+        size=gpu.uniform("II", tiles_x, capacity),
         length=visible.count,
         gaussians=visible.gaussians,
         first=visible.first,
+        before=visible.before,
         tile_counts=p.tile_counts,
         records=p.records,
         boxes=p.boxes,
-        tiles=tile_of,
-        numbers=numbers,
+        keys=keys,
         gaussian_of=gaussian_of,
         slots=slots,
     )
-    tile_of, numbers = sort(
-        space, tile_of, numbers, length, capacity=capacity, bits=tiles.bit_length()
-    )
-    size = gpu.uniform("I", tiles)
-    arrays = {"tile_of": tile_of, "ranges": visible.ranges}
-    space.run("ranges", blocks(capacity), size=size, length=length, **arrays)
-    return Lists(p, capacity, gaussian_of, numbers, visible.ranges, slots)
+    bits = (tiles_x * tiles_y).bit_length()
+    pairs = sort(space, "pairs", keys, length, capacity=capacity, bits=bits)
+    arrays = {"keys": pairs.keys, "ranges": visible.ranges}
+    space.run("ranges", blocks(capacity), length=pairs.count, **arrays)
+    return Lists(p, capacity, gaussian_of, pairs.order, visible.ranges, slots)
 
 
 def list_pairs(space: Workspace, projection: Projection) -> tuple[Lists, Totals]:
     """List the Gaussians that overlap each tile, front to back, in arrays of the needed size; waits
-    for their number. Overwrites ``projection.visible``.
+    for their number. Overwrites ``projection.depths``.
 
     Raises:
         UserError: There are too many pairs.

@@ -1,24 +1,27 @@
-// Decides whether a step is made: it is unless it has more pairs than their arrays hold, or a step
-// before was not made. The kernels that change parameters, moments and statistics read `stopped`.
+// Numbers the pairs, and decides whether a step is made: it is unless it has more pairs than their
+// arrays hold, or a step before was not made. The kernels that change parameters, moments and
+// statistics read `stopped`.
 #import common
 
 struct Size {
-    ranks: u32,     // of the Gaussians: the place of the number of pairs in `first`
     capacity: u32,  // pairs of the arrays
     at: u32,        // first word of the step in `results`
 }
 
 @group(0) @binding(0) var<uniform> size: Size;
 @group(0) @binding(1) var<storage, read> num_visible: u32;
-@group(0) @binding(2) var<storage, read> first: array<u32>;
+// The pairs of each block of visible Gaussians, then the number of pairs before each block.
+@group(0) @binding(2) var<storage, read_write> values: array<u32>;
 @group(0) @binding(3) var<storage, read> dropped: u32;
 @group(0) @binding(4) var<storage, read_write> stopped: u32;
 @group(0) @binding(5) var<storage, read_write> length: u32;  // the number of pairs that are listed
 @group(0) @binding(6) var<storage, read_write> results: array<u32>;
+#import scan_row
 
-@compute @workgroup_size(1)
-fn main() {
-    let pairs = first[size.ranks];
+@compute @workgroup_size(kThreads)
+fn main(thread: Thread, lane: Lane) {
+    let pairs = scan_row(lane, 0u, blocks_of(num_visible));
+    if (thread.local != 0u) { return; }
     if (pairs > size.capacity) { stopped = 1u; }
     length = select(pairs, 0u, stopped != 0u);
     results[size.at] = stopped;

@@ -1,12 +1,11 @@
 // Lists the (Gaussian, tile) pairs of the visible Gaussians, front to back. The pairs of a Gaussian
 // are contiguous, and start at its slot.
 #import common
+#import block
 #import record
 #import tile
 
 struct Size {
-    count: u32,
-    tiles: u32,
     tiles_x: u32,
     capacity: u32,  // of the arrays of pairs
 }
@@ -14,12 +13,12 @@ struct Size {
 @group(0) @binding(0) var<uniform> size: Size;
 @group(0) @binding(1) var<storage, read> length: u32;  // number of visible Gaussians
 @group(0) @binding(2) var<storage, read> gaussians: array<u32>;
-@group(0) @binding(3) var<storage, read> first: array<u32>;  // pair of each rank
-@group(0) @binding(4) var<storage, read> tile_counts: array<u32>;
-@group(0) @binding(5) var<storage, read> records: array<Record>;
-@group(0) @binding(6) var<storage, read> boxes: array<Box>;
-@group(0) @binding(7) var<storage, read_write> tiles: array<u32>;
-@group(0) @binding(8) var<storage, read_write> numbers: array<u32>;
+@group(0) @binding(3) var<storage, read> first: array<u32>;  // pair of each rank, in its block
+@group(0) @binding(4) var<storage, read> before: array<u32>;  // pairs before each block of ranks
+@group(0) @binding(5) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(6) var<storage, read> records: array<Record>;
+@group(0) @binding(7) var<storage, read> boxes: array<Box>;
+@group(0) @binding(8) var<storage, read_write> keys: array<u32>;  // 1 + tile
 @group(0) @binding(9) var<storage, read_write> gaussian_of: array<u32>;
 @group(0) @binding(10) var<storage, read_write> slots: array<u32>;
 
@@ -30,23 +29,22 @@ fn main(thread: Thread) {
     let i = gaussians[rank];
     let r = records[i];
     let box = boxes[i];
-    var next = first[rank];
+    var next = before[rank / kBlock] + first[rank];
     let end = min(next + tile_counts[i], size.capacity);
     slots[i] = next;
     for (var y = box.top; y <= box.bottom; y++) {
         for (var x = box.left; x <= box.right; x++) {
             if (next < end && overlaps(r, vec2(x, y))) {
-                tiles[next] = y * size.tiles_x + x;
-                numbers[next] = next;
+                keys[next] = 1u + y * size.tiles_x + x;
                 gaussian_of[next] = i;
                 next++;
             }
         }
     }
-    // Compilers may round differently in the kernel that has counted: pairs of no tile.
+    // Compilers may round differently in the kernel that has counted: pairs of no tile, which
+    // sorting leaves out.
     for (; next < end; next++) {
-        tiles[next] = size.tiles;
-        numbers[next] = next;
+        keys[next] = 0u;
         gaussian_of[next] = i;
     }
 }

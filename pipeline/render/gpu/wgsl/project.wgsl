@@ -12,7 +12,7 @@
 @group(0) @binding(4) var<storage, read_write> boxes: array<Box>;
 @group(0) @binding(5) var<storage, read_write> radii: array<f32>;
 @group(0) @binding(6) var<storage, read_write> tile_counts: array<u32>;
-@group(0) @binding(7) var<storage, read_write> visible: array<u32>;
+@group(0) @binding(7) var<storage, read_write> depths: array<u32>;  // 0: not visible
 @group(0) @binding(8) var<storage, read_write> dropped: atomic<u32>;
 #import geometry
 
@@ -48,7 +48,7 @@ fn main(thread: Thread) {
     if (i >= view.gaussians) { return; }
     radii[i] = 0.0;
     tile_counts[i] = 0u;
-    visible[i] = 0u;
+    depths[i] = 0u;
     let in = inputs_of(i, view.gaussians);
     if (!valid(in)) {
         atomicAdd(&dropped, 1u);
@@ -102,5 +102,6 @@ fn main(thread: Thread) {
     }
     radii[i] = sqrt(reach2 * longest);
     tile_counts[i] = count;
-    visible[i] = 1u;
+    // Positive floats are ordered like their bit patterns.
+    depths[i] = max(bitcast<u32>(r.depth), 1u);
 }

@@ -1,50 +1,20 @@
-// Exclusive prefix sums, 1024 numbers per workgroup (`blocks`), and the addition of the sums of the
-// workgroups before (`add`). Longer arrays are scanned by levels (sort.py).
+// Exclusive prefix sums of the rows of a table, a workgroup for each row. A row has an element for
+// each block of elements of another array.
 #import common
 
 struct Size {
-    count: u32,
+    stride: u32,  // between rows
 }
 
 @group(0) @binding(0) var<uniform> size: Size;
-@group(0) @binding(1) var<storage, read_write> values: array<u32>;
-@group(0) @binding(2) var<storage, read_write> sums: array<u32>;  // of each workgroup
-
-const kEach = 4u;  // numbers per thread
-var<workgroup> running: array<u32, kThreads>;
-
-@compute @workgroup_size(kThreads)
-fn blocks(thread: Thread) {
-    let block = group_of(thread);
-    let first = (block * kThreads + thread.local) * kEach;
-    var before: array<u32, kEach>;
-    var sum = 0u;
-    for (var j = 0u; j < kEach; j++) {
-        before[j] = sum;
-        if (first + j < size.count) { sum += values[first + j]; }
-    }
-    running[thread.local] = sum;
-    for (var step = 1u; step < kThreads; step *= 2u) {
-        workgroupBarrier();
-        var left = 0u;
-        if (thread.local >= step) { left = running[thread.local - step]; }
-        workgroupBarrier();
-        running[thread.local] += left;
-    }
-    let base = running[thread.local] - sum;
-    for (var j = 0u; j < kEach; j++) {
-        if (first + j < size.count) { values[first + j] = base + before[j]; }
-    }
-    if (thread.local == kThreads - 1u && block * kThreads * kEach < size.count) {
-        sums[block] = running[thread.local];
-    }
-}
+@group(0) @binding(1) var<storage, read> length: u32;  // of the other array
+@group(0) @binding(2) var<storage, read_write> values: array<u32>;
+@group(0) @binding(3) var<storage, read_write> totals: array<u32>;  // of the rows
+#import scan_row
 
 @compute @workgroup_size(kThreads)
-fn add(thread: Thread) {
-    let block = group_of(thread);
-    let first = (block * kThreads + thread.local) * kEach;
-    for (var j = 0u; j < kEach; j++) {
-        if (first + j < size.count) { values[first + j] += sums[block]; }
-    }
+fn main(thread: Thread, lane: Lane) {
+    let row = group_of(thread);
+    let total = scan_row(lane, row * size.stride, blocks_of(length));
+    if (thread.local == 0u) { totals[row] = total; }
 }

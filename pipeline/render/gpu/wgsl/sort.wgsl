@@ -1,23 +1,29 @@
-// One pass of a stable radix sort by 4 bits of the keys (least significant digit first): `histogram`
-// counts the digits of each block of 1024 keys; after their prefix sum, `scatter` writes keys and
-// values to their places. Only integers are added, so the order of additions does not matter.
+// One pass of a stable radix sort by 8 bits of the keys (least significant digit first), which
+// leaves out keys of zero. `histogram` counts the digits of each block of keys. After the prefix
+// sums of each digit over the blocks (scan.wgsl), `scatter` sorts each block in the workgroup's
+// memory, by two bits at a time, and writes the runs of equal digits to their places. Only integers
+// are added, so the order of additions does not matter.
 #import common
 
 struct Pass {
-    shift: u32,
-    blocks: u32,
+    shift: u32,   // of the digit
+    blocks: u32,  // for which `places` has room
 }
 
 @group(0) @binding(0) var<uniform> pass_: Pass;
 @group(0) @binding(1) var<storage, read> length: u32;  // of the arrays
 @group(0) @binding(2) var<storage, read> keys: array<u32>;
-@group(0) @binding(3) var<storage, read> values: array<u32>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;  // not read by the first pass
 @group(0) @binding(4) var<storage, read_write> places: array<u32>;  // digit-major
-@group(0) @binding(5) var<storage, read_write> sorted_keys: array<u32>;
-@group(0) @binding(6) var<storage, read_write> sorted_values: array<u32>;
+@group(0) @binding(5) var<storage, read> totals: array<u32>;  // of the digits
+@group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
+@group(0) @binding(7) var<storage, read_write> sorted_order: array<u32>;
+@group(0) @binding(8) var<storage, read_write> count: u32;  // of sorted keys: by the first pass
+#import block
+#import prefix
 
-const kDigits = 16u;
-const kEach = 4u;  // consecutive keys per thread
+const kDigits = kThreads;  // A thread takes a digit of the tables.
+const kNone = 0xffffffffu;
 
 fn digit_of(key: u32) -> u32 {
     return (key >> pass_.shift) & (kDigits - 1u);
@@ -28,65 +34,99 @@ var<workgroup> counts: array<atomic<u32>, kDigits>;
 @compute @workgroup_size(kThreads)
 fn histogram(thread: Thread) {
     let block = group_of(thread);
-    let first = (block * kThreads + thread.local) * kEach;
+    let first = block * kBlock + thread.local;
+    if (block * kBlock >= length) { return; }
     // Some drivers do not zero the memory of workgroups.
-    if (thread.local < kDigits) { atomicStore(&counts[thread.local], 0u); }
+    atomicStore(&counts[thread.local], 0u);
     workgroupBarrier();
-    for (var j = 0u; j < kEach; j++) {
-        if (first + j < length) { atomicAdd(&counts[digit_of(keys[first + j])], 1u); }
+    for (var i = first; i < min(length, first + kBlock); i += kThreads) {
+        if (keys[i] != 0u) { atomicAdd(&counts[digit_of(keys[i])], 1u); }
     }
     workgroupBarrier();
-    if (thread.local < kDigits && block < pass_.blocks) {
-        places[thread.local * pass_.blocks + block] = atomicLoad(&counts[thread.local]);
+    places[thread.local * pass_.blocks + block] = atomicLoad(&counts[thread.local]);
+}
+
+// Four numbers of 16 bits, by two bits of the digit.
+fn one_of(bits: u32) -> vec2<u32> {
+    let one = 1u << (16u * (bits & 1u));
+    return select(vec2(one, 0u), vec2(0u, one), bits >= 2u);
+}
+fn number_at(numbers: vec2<u32>, bits: u32) -> u32 {
+    return (select(numbers.x, numbers.y, bits >= 2u) >> (16u * (bits & 1u))) & 0xffffu;
+}
+// The exclusive prefix sums of the four.
+fn prefix_of_four(numbers: vec2<u32>) -> vec2<u32> {
+    let half = (numbers.x & 0xffffu) + (numbers.x >> 16u);
+    return (numbers << vec2(16u)) + vec2(0u, half | (half << 16u));
+}
+
+// The keys of the block: the digit and, in the lower 16 bits, the place in the block.
+var<workgroup> entries: array<u32, kBlock>;
+// The place of the first key of each digit, less its place in `entries`.
+var<workgroup> starts: array<u32, kDigits>;
+
+// Sorts `entries` without those of kNone; returns the number of the others.
+fn sort_block(lane: Lane) -> u32 {
+    let own = kEach * ordinal(lane);
+    var used = kBlock;
+    for (var shift = 16u; shift < 24u; shift += 2u) {
+        workgroupBarrier();
+        var mine: array<u32, kEach>;
+        var found = vec2(0u);
+        for (var j = 0u; j < kEach; j++) {
+            mine[j] = kNone;
+            if (own + j < used) { mine[j] = entries[own + j]; }
+            if (mine[j] != kNone) { found += one_of((mine[j] >> shift) & 3u); }
+        }
+        let sums = prefix(lane, found);
+        var next = sums.before + prefix_of_four(sums.total);
+        for (var j = 0u; j < kEach; j++) {
+            if (mine[j] != kNone) {
+                let bits = (mine[j] >> shift) & 3u;
+                entries[number_at(next, bits)] = mine[j];
+                next += one_of(bits);
+            }
+        }
+        let half = sums.total.x + sums.total.y;
+        used = (half & 0xffffu) + (half >> 16u);
     }
-}
-
-// Numbers of the digits among the keys of the threads before: 16 counters of 16 bits.
-struct Counters {
-    low: vec4<u32>,
-    high: vec4<u32>,
-}
-var<workgroup> running: array<Counters, kThreads>;
-
-fn counter(c: Counters, digit: u32) -> u32 {
-    let word = digit / 2u;
-    let pair = select(c.high[word & 3u], c.low[word & 3u], word < 4u);
-    return (pair >> (16u * (digit & 1u))) & 0xffffu;
+    workgroupBarrier();
+    return used;
 }
 
 @compute @workgroup_size(kThreads)
-fn scatter(thread: Thread) {
+fn scatter(thread: Thread, lane: Lane) {
     let block = group_of(thread);
-    let first = (block * kThreads + thread.local) * kEach;
-    var own = Counters(vec4(0u), vec4(0u));
-    for (var j = 0u; j < kEach; j++) {
-        if (first + j < length) {
-            let digit = digit_of(keys[first + j]);
-            let word = digit / 2u;
-            let one = 1u << (16u * (digit & 1u));
-            if (word < 4u) { own.low[word] += one; } else { own.high[word - 4u] += one; }
+    let first = block * kBlock;
+    if (block > 0u && first >= length) { return; }
+    let digit = ordinal(lane);
+    let of_digits = prefix(lane, vec2(totals[digit], 0u));
+    starts[digit] = of_digits.before.x + places[digit * pass_.blocks + block];
+    if (block == 0u && digit == 0u && pass_.shift == 0u) {
+        count = of_digits.total.x;
+    }
+    for (var at = thread.local; at < kBlock; at += kThreads) {
+        var entry = kNone;
+        if (first + at < length) {
+            let key = keys[first + at];
+            if (key != 0u) { entry = (digit_of(key) << 16u) | at; }
         }
+        entries[at] = entry;
     }
-    running[thread.local] = own;
-    for (var step = 1u; step < kThreads; step *= 2u) {
-        workgroupBarrier();
-        var left = Counters(vec4(0u), vec4(0u));
-        if (thread.local >= step) { left = running[thread.local - step]; }
-        workgroupBarrier();
-        running[thread.local].low += left.low;
-        running[thread.local].high += left.high;
+    let used = sort_block(lane);
+    for (var at = thread.local; at < used; at += kThreads) {
+        let digit = entries[at] >> 16u;
+        if (at == 0u || entries[at - 1u] >> 16u != digit) { starts[digit] -= at; }
     }
-    let before = Counters(running[thread.local].low - own.low, running[thread.local].high - own.high);
-    for (var j = 0u; j < kEach; j++) {
-        if (first + j < length) {
-            let key = keys[first + j];
-            let digit = digit_of(key);
-            var place = places[digit * pass_.blocks + block] + counter(before, digit);
-            for (var earlier = 0u; earlier < j; earlier++) {
-                place += u32(digit_of(keys[first + earlier]) == digit);
-            }
-            sorted_keys[place] = key;
-            sorted_values[place] = values[first + j];
+    workgroupBarrier();
+    for (var at = thread.local; at < used; at += kThreads) {
+        let place = starts[entries[at] >> 16u] + at;
+        let i = first + (entries[at] & 0xffffu);
+        sorted_keys[place] = keys[i];
+        if (pass_.shift == 0u) {
+            sorted_order[place] = i;
+        } else {
+            sorted_order[place] = order[i];
         }
     }
 }

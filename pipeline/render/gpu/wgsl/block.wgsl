@@ -1,0 +1,7 @@
+// Blocks of consecutive elements, one for each workgroup; a thread takes kEach of them.
+const kEach = 8u;
+const kBlock = kEach * kThreads;
+
+fn blocks_of(count: u32) -> u32 {
+    return (count + kBlock - 1u) / kBlock;
+}

@@ -34,7 +34,7 @@ def test_steps_do_not_wait_for_the_device(counts: Counts) -> None:
 
 
 def test_a_step_takes_few_dispatches(counts: Counts) -> None:
-    assert counts.dispatches <= 46 * STEPS
+    assert counts.dispatches <= 27 * STEPS
     assert counts.copies == 0
     assert counts.submissions <= 2 * STEPS
 

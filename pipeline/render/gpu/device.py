@@ -99,8 +99,8 @@ class Gpu:
 
     Args:
         number: The N of ``gpu:N``.
-        subgroups: Whether kernels use subgroups if the device has them. Results do not depend on
-            it.
+        subgroups: Whether kernels use subgroups if the device has them; None: not in software,
+            where they are slower. Results do not depend on it.
 
     Attributes:
         subgroups: Whether kernels use subgroups.
@@ -110,7 +110,7 @@ class Gpu:
         UserError: there is no such device, or it lacks what the kernels need.
     """
 
-    def __init__(self, number: int = 0, *, subgroups: bool = True):
+    def __init__(self, number: int = 0, *, subgroups: bool | None = None):
         found = _adapters()
         if number >= len(found):
             raise UserError(f"no GPU {number}: {len(found)} found", fix=NO_GPU)
@@ -128,6 +128,8 @@ class Gpu:
         self.device = adapter.request_device_sync(
             required_limits=requested, required_features=features
         )
+        if subgroups is None:
+            subgroups = self.adapter.kind != "software"
         self.subgroups = subgroups and SUBGROUPS in features
         self.max_bytes = min(limits[name] for name in WANTED)
         self._pipelines: dict[str, tuple[Any, Any]] = {}

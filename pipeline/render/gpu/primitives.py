@@ -1,4 +1,4 @@
-"""Prefix sums, stable radix sorting, and sums over rows in a fixed order."""
+"""Stable radix sorting, and sums over rows in a fixed order."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pipeline.render.gpu.workspace import Workspace
 ROWS = 1024  # The rows of a workgroup in sum_rows.wgsl.
 BLOCK = 2048  # kBlock in block.wgsl
 DIGIT_BITS, DIGITS = 8, 256  # Of a pass of sort.wgsl.
+SCANNED = 8  # kScanned in sort.wgsl
 
 
 @dataclass(frozen=True)
@@ -30,21 +31,6 @@ class Sorted:
     count: Buffer
 
 
-def scan(
-    space: Workspace, values: Buffer, rows: int, length: Buffer, stride: int, totals: Buffer
-) -> None:
-    """Replace the rows of a table of uint32 by their exclusive prefix sums.
-
-    Args:
-        length: One uint32, the length of an array. Each row has an element for each ``BLOCK`` of
-            its elements.
-        stride: The distance between the starts of two rows.
-        totals: (rows,) uint32, becomes the sums of the rows.
-    """
-    size = space.gpu.uniform("I", stride)
-    space.run("scan", rows, size=size, length=length, values=values, totals=totals)
-
-
 def sort(
     space: Workspace, name: str, keys: Buffer, length: Buffer, *, capacity: int, bits: int
 ) -> Sorted:
@@ -58,7 +44,8 @@ def sort(
         length: One uint32, the number of keys, which is at most ``capacity``.
     """
     groups, size = max(1, blocks(capacity, BLOCK)), 4 * capacity
-    places, totals = space.get("places of digits", 4 * DIGITS * groups), space.get("digits", 1024)
+    places = space.get("places of digits", 4 * DIGITS * groups)
+    totals = space.get("numbers of digits", 4 * DIGITS)
     count = space.get(f"number of {name}", 4)
     other_keys = space.get("sort keys", size)
     order, other_order = space.get(f"order of {name}", size), space.get("sort order", size)
@@ -66,17 +53,15 @@ def sort(
     if passes % 2 == 0:  # The last pass writes to the order of this name.
         order, other_order = other_order, order
     for each in range(passes):
-        arguments = {
-            "pass_": space.gpu.uniform("II", DIGIT_BITS * each, groups),
-            "length": count if each else length,
-            "keys": keys,
-            "places": places,
-        }
-        space.run("sort.histogram", groups, **arguments)
-        scan(space, places, DIGITS, arguments["length"], groups, totals)
-        arguments |= {"totals": totals, "sorted_keys": other_keys, "sorted_order": order}
-        arguments |= {"order": other_order} if each else {"count": count}
-        space.run("sort.scatter", groups, **arguments)
+        pass_, used = space.gpu.uniform("I", DIGIT_BITS * each), count if each else length
+        both = {"pass_": pass_, "length": used, "keys": keys, "places": places}
+        space.run("sort.histogram", groups, **both)
+        space.run("sort.scan", DIGITS // SCANNED, length=used, places=places, totals=totals)
+        more = {"order": other_order} if each else {"count": count}
+        space.run(
+            "sort.scatter", groups, **both, **more, totals=totals, sorted_keys=other_keys,
+            sorted_order=order,
+        )  # fmt: skip
         keys, other_keys = other_keys, keys
         order, other_order = other_order, order
     return Sorted(keys, other_order, count)

@@ -234,7 +234,7 @@ def admit(
         1,
         size=space.gpu.uniform("II", capacity, at),
         num_visible=visible.count,
-        values=visible.before,
+        before=visible.before,
         dropped=visible.projection.dropped,
         stopped=stopped,
         length=length,

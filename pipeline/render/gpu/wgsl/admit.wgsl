@@ -11,16 +11,38 @@ struct Size {
 @group(0) @binding(0) var<uniform> size: Size;
 @group(0) @binding(1) var<storage, read> num_visible: u32;
 // The pairs of each block of visible Gaussians, then the number of pairs before each block.
-@group(0) @binding(2) var<storage, read_write> values: array<u32>;
+@group(0) @binding(2) var<storage, read_write> before: array<u32>;
 @group(0) @binding(3) var<storage, read> dropped: u32;
 @group(0) @binding(4) var<storage, read_write> stopped: u32;
 @group(0) @binding(5) var<storage, read_write> length: u32;  // the number of pairs that are listed
 @group(0) @binding(6) var<storage, read_write> results: array<u32>;
-#import scan_row
+#import block
+#import prefix
+
+// Replaces the elements of `before` by their exclusive prefix sums; returns their sum.
+fn scan(lane: Lane, count: u32) -> u32 {
+    let own = kEach * ordinal(lane);
+    var sum = 0u;
+    for (var start = 0u; start < count; start += kBlock) {
+        let first = start + own;
+        var inside: array<u32, kEach>;
+        var of_thread = 0u;
+        for (var j = 0u; j < kEach; j++) {
+            inside[j] = of_thread;
+            if (first + j < count) { of_thread += before[first + j]; }
+        }
+        let found = prefix(lane, vec2(of_thread, 0u));
+        for (var j = 0u; j < kEach; j++) {
+            if (first + j < count) { before[first + j] = sum + found.before.x + inside[j]; }
+        }
+        sum += found.total.x;
+    }
+    return sum;
+}
 
 @compute @workgroup_size(kThreads)
 fn main(thread: Thread, lane: Lane) {
-    let pairs = scan_row(lane, 0u, blocks_of(num_visible));
+    let pairs = scan(lane, blocks_of(num_visible));
     if (thread.local != 0u) { return; }
     if (pairs > size.capacity) { stopped = 1u; }
     length = select(pairs, 0u, stopped != 0u);

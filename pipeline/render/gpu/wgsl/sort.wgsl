@@ -1,21 +1,20 @@
 // One pass of a stable radix sort by 8 bits of the keys (least significant digit first), which
-// leaves out keys of zero. `histogram` counts the digits of each block of keys. After the prefix
-// sums of each digit over the blocks (scan.wgsl), `scatter` sorts each block in the workgroup's
-// memory, by two bits at a time, and writes the runs of equal digits to their places. Only integers
-// are added, so the order of additions does not matter.
+// leaves out keys of zero. `histogram` counts the digits of each block of keys, and `scan` adds those
+// of the blocks before. `scatter` sorts each block in the workgroup's memory, by two bits at a time,
+// and writes the runs of equal digits to their places. Only integers are added, so the order of
+// additions does not matter.
 #import common
 
 struct Pass {
-    shift: u32,   // of the digit
-    blocks: u32,  // for which `places` has room
+    shift: u32,  // of the digit
 }
 
 @group(0) @binding(0) var<uniform> pass_: Pass;
 @group(0) @binding(1) var<storage, read> length: u32;  // of the arrays
 @group(0) @binding(2) var<storage, read> keys: array<u32>;
 @group(0) @binding(3) var<storage, read> order: array<u32>;  // not read by the first pass
-@group(0) @binding(4) var<storage, read_write> places: array<u32>;  // digit-major
-@group(0) @binding(5) var<storage, read> totals: array<u32>;  // of the digits
+@group(0) @binding(4) var<storage, read_write> places: array<u32>;  // of digits, by block
+@group(0) @binding(5) var<storage, read_write> totals: array<u32>;  // of the digits
 @group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(7) var<storage, read_write> sorted_order: array<u32>;
 @group(0) @binding(8) var<storage, read_write> count: u32;  // of sorted keys: by the first pass
@@ -43,7 +42,35 @@ fn histogram(thread: Thread) {
         if (keys[i] != 0u) { atomicAdd(&counts[digit_of(keys[i])], 1u); }
     }
     workgroupBarrier();
-    places[thread.local * pass_.blocks + block] = atomicLoad(&counts[thread.local]);
+    places[block * kDigits + thread.local] = atomicLoad(&counts[thread.local]);
+}
+
+// A workgroup scans kScanned digits; for each, kParts threads take consecutive blocks.
+const kScanned = 8u;
+const kParts = kThreads / kScanned;
+var<workgroup> parts: array<u32, kThreads>;
+
+@compute @workgroup_size(kThreads)
+fn scan(thread: Thread) {
+    let column = thread.local % kScanned;
+    let digit = group_of(thread) * kScanned + column;
+    let part = thread.local / kScanned;
+    let blocks = blocks_of(length);
+    let each = (blocks + kParts - 1u) / kParts;
+    let begin = min(part * each, blocks);
+    let end = min(begin + each, blocks);
+    var sum = 0u;
+    for (var block = begin; block < end; block++) { sum += places[block * kDigits + digit]; }
+    parts[thread.local] = sum;
+    workgroupBarrier();
+    var place = 0u;
+    for (var before = 0u; before < part; before++) { place += parts[before * kScanned + column]; }
+    if (part == kParts - 1u) { totals[digit] = place + sum; }
+    for (var block = begin; block < end; block++) {
+        let found = places[block * kDigits + digit];
+        places[block * kDigits + digit] = place;
+        place += found;
+    }
 }
 
 // Four numbers of 16 bits, by two bits of the digit.
@@ -101,7 +128,7 @@ fn scatter(thread: Thread, lane: Lane) {
     if (block > 0u && first >= length) { return; }
     let digit = ordinal(lane);
     let of_digits = prefix(lane, vec2(totals[digit], 0u));
-    starts[digit] = of_digits.before.x + places[digit * pass_.blocks + block];
+    starts[digit] = of_digits.before.x + places[block * kDigits + digit];
     if (block == 0u && digit == 0u && pass_.shift == 0u) {
         count = of_digits.total.x;
     }

@@ -13,6 +13,10 @@ from dataclasses import dataclass
 from benchmarks import markdown
 from benchmarks.results import GpuCountsResult
 
+# The least bytes of a step, each number read and written once: of a Gaussian, 59 parameters of SH
+# degree 3 with two moments each; of a pair, its Gaussian and its twelve moments of gradients; of a
+# pixel, its colour and the gradient on it, while the photograph's bytes are only read.
+GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 2 * 4 * 3 * 59, 2 * 4 * 13, 2 * 4 * 6 + 3
 DISPATCH_MS = 4e-3  # Assumed: the start of a kernel and the barrier before it.
 
 
@@ -43,15 +47,24 @@ def counts_table(found: Sequence[GpuCountsResult]) -> str:
     rows = [
         [
             *("Gaussians, pixels", "pairs", "waits", "dispatches of a step"),
-            *("copies of a step", "memory of a step (MB)", "arithmetic of a step (GFLOP)"),
+            *("copies of a step", "memory of a step (MB)", "least memory (MB)", "ratio"),
+            "arithmetic of a step (GFLOP)",
         ]
     ]
     for r in found:
         waits = f"{r.waits} in {r.steps} steps"
         counts = (f"{r.dispatches:.0f}", f"{r.copies:.0f}")
-        work = (f"{sum(r.memory_mb.values()):.0f}", f"{r.gflop:.1f}")
+        memory, least = sum(r.memory_mb.values()), least_mb(r)
+        work = (f"{memory:.0f}", f"{least:.0f}", f"{memory / least:.2f}", f"{r.gflop:.1f}")
         rows.append([_scene(r), f"{r.pairs:,}", waits, *counts, *work])
     return markdown.table(rows)
+
+
+def least_mb(result: GpuCountsResult) -> float:
+    """The bytes of a step's parameters, moments, pairs and images, read and written once, in MB."""
+    pixels = result.width * result.height
+    sizes = GAUSSIAN_BYTES * result.gaussians, PAIR_BYTES * result.pairs, PIXEL_BYTES * pixels
+    return 1e-6 * sum(sizes)
 
 
 def model_table(found: Sequence[GpuCountsResult]) -> str:

@@ -258,8 +258,8 @@ class GpuCountsResult:
         dispatches, copies, submissions: Of kernels, of copies and clears of buffers, and of command
             buffers, in a step.
         uploaded_mb: Copied to the device in a step.
-        memory_mb: The bytes in use of each buffer, read and written once by each kernel that is
-            bound to it, in a step.
+        memory_mb: The bytes in use of each buffer, read and written once by each kernel that
+            reads it or writes to it, in a step.
         gflop: The arithmetic of a step if no pixel is done before the last Gaussian.
     """
 

@@ -12,6 +12,7 @@ from pipeline.render.calibration import StepScene
 from pipeline.render.gpu import kernels, resident
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.counts import Counts
+from pipeline.render.gpu.kernels import Use
 from tests.render.scenes import camera, random_scene
 from tests.tools import need_gpu
 
@@ -57,6 +58,13 @@ def test_pairs_have_little_room(counts: Counts) -> None:
     assert pairs <= max(resident.MIN_CAPACITY, 4 * GAUSSIANS)
 
 
-def test_outputs_are_not_counted_as_inputs() -> None:
-    found = {b.name: b.only_written for b in kernels.source("project_backward").bindings}
-    assert found["gradients"] and not found["sh"] and not found["slots"]
+def test_uses_of_buffers_are_read_from_the_kernels() -> None:
+    found = kernels.uses("project_backward")
+    assert found["gradients"] == Use(read=False, written=True)
+    assert found["exp_avg"] == found["sh"] == Use(read=True, written=True)
+    assert found["slots"] == Use(read=True, written=False)
+    forward, backward = kernels.uses("loss.forward"), kernels.uses("loss.backward")
+    assert forward["derivatives"] == Use(read=False, written=True)
+    assert backward["derivatives"] == Use(read=True, written=False)
+    assert forward["gradient"] == Use(read=False, written=False)
+    assert kernels.uses("project")["dropped"] == Use(read=True, written=True)  # atomic

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from pipeline.render.gpu.kernels import Binding
+from pipeline.render.gpu.kernels import Use
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,11 +15,11 @@ class BindGroup:
 
     Attributes:
         group: The ``wgpu.GPUBindGroup``.
-        buffers: The buffers with their bindings, without placeholders.
+        buffers: The buffers with their uses, without placeholders.
     """
 
     group: Any
-    buffers: tuple[tuple[Binding, Any], ...]
+    buffers: tuple[tuple[Use, Any], ...]
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Traffic:
     """The bytes of the device's memory that kernels and copies read and write, by the names of the
     buffers.
 
-    A kernel that is bound to a buffer counts as if it read or wrote each byte in use once. Kernels
+    A kernel that uses a buffer counts as if it read or wrote each byte in use once. Kernels
     that gather the same record several times read more, and kernels that leave early less.
 
     Attributes:
@@ -43,11 +43,11 @@ class Traffic:
         return self.read.total() + self.written.total()
 
     def add_kernel(self, group: BindGroup) -> None:
-        for binding, buffer in group.buffers:
+        for use, buffer in group.buffers:
             size = min(buffer.size, self.used.get(buffer.label, buffer.size))
-            if binding.kind == "read_write":
+            if use.written:
                 self.written[buffer.label] += size
-            if not binding.only_written:
+            if use.read:
                 self.read[buffer.label] += size
 
 

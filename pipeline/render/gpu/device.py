@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render.gpu.counts import BindGroup, Counts
-from pipeline.render.gpu.kernels import source
+from pipeline.render.gpu.kernels import source, uses
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import install_extra
 
@@ -250,7 +250,8 @@ class Gpu:
             resource = {"buffer": buffer, "offset": 0, "size": buffer.size}
             entries.append({"binding": binding.number, "resource": resource})
         group = self.device.create_bind_group(layout=layout, entries=entries)
-        return BindGroup(group, tuple((b, buffers[b.name]) for b in bindings if b.name in buffers))
+        used = uses(kernel)
+        return BindGroup(group, tuple((used[name], buffer) for name, buffer in buffers.items()))
 
     def dispatch(self, kernel: str, groups: int | tuple[int, int, int], bound: BindGroup) -> None:
         """Record a kernel with the result of ``bind``."""

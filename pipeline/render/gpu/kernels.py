@@ -24,6 +24,7 @@ _BINDING = re.compile(
     r"(?:, (?P<access>read_write|read))?> (?P<name>\w+):"
 )
 _CONSTANT = re.compile(r"constexpr (?P<type>double|float|int) (?P<name>k\w+) = (?P<value>[^;]+);")
+_ENTRY = re.compile(r"^@compute[^{]*?\bfn (?P<name>\w+)\(.*?^\}$", re.MULTILINE | re.DOTALL)
 _IMPORT = re.compile(r"^#import (\w+)$", re.MULTILINE)
 
 
@@ -33,13 +34,19 @@ class Binding:
 
     Attributes:
         kind: ``uniform``, ``read`` or ``read_write``.
-        only_written: Whether the kind is ``read_write`` but no kernel of the module reads it.
     """
 
     number: int
     name: str
     kind: str
-    only_written: bool = False
+
+
+@dataclass(frozen=True)
+class Use:
+    """Whether a kernel reads a buffer, and whether it writes to it."""
+
+    read: bool
+    written: bool
 
 
 @dataclass(frozen=True)
@@ -60,22 +67,29 @@ def source(name: str, subgroups: bool = False) -> Source:
     text = (FOLDER / f"{name}.wgsl").read_text("utf-8")
     text = constants() + _with_imports(text, {name}, subgroups)
     bindings = tuple(
-        Binding(
-            int(m["number"]),
-            m["name"],
-            m["access"] or "uniform",
-            m["access"] == "read_write" and _is_only_assigned(m["name"], text),
-        )
+        Binding(int(m["number"]), m["name"], m["access"] or "uniform")
         for m in _BINDING.finditer(text)
     )
     return Source(text, bindings)
 
 
-def _is_only_assigned(name: str, text: str) -> bool:
-    """Return True if each use of a variable, apart from its declaration, is an assignment."""
-    code = re.sub(r"//.*", "", text)
-    assigned = re.findall(rf"(?m)(?:^|\{{)\s*{name}(?:\[[^=;]*\])?(?:\.\w+)? = ", code)
-    return len(re.findall(rf"\b{name}\b", code)) == len(assigned) + 1
+@cache
+def uses(kernel: str) -> dict[str, Use]:
+    """The uses of the bindings of a kernel, named as for ``Gpu.run``. Functions that several
+    kernels of a module can call count for each of them."""
+    name, _, entry = kernel.partition(".")
+    code = re.sub(r"//.*", "", source(name).code)
+    code = _ENTRY.sub(lambda m: m[0] if m["name"] == (entry or "main") else "", code)
+    return {binding.name: _use(binding.name, code) for binding in source(name).bindings}
+
+
+def _use(name: str, code: str) -> Use:
+    # Members of structs can have the same name.
+    found = len(re.findall(rf"(?<!\.)\b{name}\b", code)) - 1  # without the declaration
+    place = rf"(?m)(?:^|\{{)\s*{name}(?:\[[^=;]*\])?(?:\.\w+)?"
+    assigned = len(re.findall(place + " = ", code))
+    changed = re.search(place + " [-+*/|&]= ", code) or f"&{name}" in code
+    return Use(read=found > assigned, written=assigned > 0 or bool(changed))
 
 
 @cache

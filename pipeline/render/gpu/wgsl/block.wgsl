@@ -2,6 +2,6 @@
 const kEach = 8u;
 const kBlock = kEach * kThreads;
 
-fn blocks_of(count: u32) -> u32 {
-    return (count + kBlock - 1u) / kBlock;
+fn blocks_of(elements: u32) -> u32 {
+    return (elements + kBlock - 1u) / kBlock;
 }

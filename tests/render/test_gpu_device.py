@@ -84,6 +84,20 @@ def test_bands_of_tiles_give_the_same_bits(gpu: Gpu, monkeypatch: pytest.MonkeyP
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+def test_pairs_that_are_not_listed_are_not_counted(gpu: Gpu) -> None:
+    """Kernels may round differently: here, each Gaussian was counted in one tile too many."""
+    backend, scene, view = make_backend("gpu"), random_scene(1, 300), camera(70, 90)
+    assert isinstance(backend, GpuBackend)
+    expected = backend.forward(*scene, view, RasterOptions())
+    projected = backend.project(scene, view, RasterOptions())
+    counts = gpu.read(projected.projection.tile_counts, np.uint32, 300)
+    gpu.write(projected.projection.tile_counts, counts + (counts > 0).astype(np.uint32))
+    drawn = backend.blend(backend.bin(projected))
+    assert drawn.num_intersections == expected.num_intersections + (counts > 0).sum()
+    assert torch.equal(drawn.color, expected.color)
+    assert (gpu.read(projected.projection.tile_counts, np.uint32, 300) == counts).all()
+
+
 def test_a_lost_device_is_an_error(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
     def lost(*args: object) -> None:
         raise RuntimeError("Parent device is lost")

@@ -15,7 +15,7 @@ struct Size {
 @group(0) @binding(2) var<storage, read> gaussians: array<u32>;
 @group(0) @binding(3) var<storage, read> first: array<u32>;  // pair of each rank, in its block
 @group(0) @binding(4) var<storage, read> before: array<u32>;  // pairs before each block of ranks
-@group(0) @binding(5) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(5) var<storage, read_write> tile_counts: array<u32>;
 @group(0) @binding(6) var<storage, read> records: array<Record>;
 @group(0) @binding(7) var<storage, read> boxes: array<Box>;
 @group(0) @binding(8) var<storage, read_write> keys: array<u32>;  // 1 + tile
@@ -29,9 +29,10 @@ fn main(thread: Thread) {
     let i = gaussians[rank];
     let r = records[i];
     let box = boxes[i];
-    var next = before[rank / kBlock] + first[rank];
-    let end = min(next + tile_counts[i], size.capacity);
-    slots[i] = next;
+    let slot = before[rank / kBlock] + first[rank];
+    let end = min(slot + tile_counts[i], size.capacity);
+    var next = slot;
+    slots[i] = slot;
     for (var y = box.top; y <= box.bottom; y++) {
         for (var x = box.left; x <= box.right; x++) {
             if (next < end && overlaps(r, vec2(x, y))) {
@@ -42,7 +43,8 @@ fn main(thread: Thread) {
         }
     }
     // Compilers may round differently in the kernel that has counted: pairs of no tile, which
-    // sorting leaves out.
+    // sorting leaves out, and whose slots nothing writes.
+    if (next < end) { tile_counts[i] = next - slot; }
     for (; next < end; next++) {
         keys[next] = 0u;
         gaussian_of[next] = i;

@@ -32,14 +32,13 @@ from pipeline.runtime.errors import UserError
 # The kernels of each phase of a step, in order.
 PHASES = {
     "projection, SH": ("project",),
-    "bin": ("scan.blocks", "scan.add", "compact", "sort.histogram", "sort.scatter", "order",
-            "admit", "pairs", "ranges"),
+    "bin": ("sort.histogram", "sort.scan", "sort.scatter", "order", "admit", "pairs", "ranges"),
     "blend": ("blend",),
     "loss": ("loss.forward", "loss.backward", "sum_rows"),
     "blend backward": ("blend_backward",),
     "projection backward": ("project_backward",),
     "Adam, statistics": ("optimise",),
-}  # fmt: skip
+}
 COPIED = 1 << 28  # The number of bytes that the measurement of bandwidth copies.
 
 

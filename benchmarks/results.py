@@ -553,3 +553,37 @@ class PoseResult:
     outcome: PoseOutcome
     text: str
     seconds: float
+
+
+# ---- benchmarks.serial ----
+
+STEP = "step"
+
+
+@dataclass(frozen=True)
+class SerialResult:
+    """A phase of a training step on one thread and on several.
+
+    Attributes:
+        phase: ``STEP`` for the sum of all phases.
+        one_ms, many_ms: The time of the phase in a step, on one thread and on ``threads``.
+        step_ms: The time of the step on one thread.
+        control: The speed-up of a loop without memory and shared state by the same threads.
+    """
+
+    scene: str
+    threads: int
+    phase: str
+    one_ms: float
+    many_ms: float
+    step_ms: float
+    control: float
+
+    def serial_ms(self, ideal: float) -> float:
+        """The serial part of T(1) by Amdahl's law, where a parallel part is ``ideal`` times as fast
+        on ``threads``: T(n) = serial + (T(1) - serial) / ideal."""
+        return (ideal * self.many_ms - self.one_ms) / (ideal - 1)
+
+    def share(self, ideal: float) -> float:
+        """The serial part over the step on one thread."""
+        return self.serial_ms(ideal) / self.step_ms

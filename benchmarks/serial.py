@@ -43,7 +43,7 @@ from pipeline.training.loop.train import single_torch_thread
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 
-VIEWS = 8
+VIEWS = 48
 TURN = 10  # steps; the steps between two densifications are a multiple
 KERNELS = {
     "project": "projection, SH",
@@ -54,10 +54,12 @@ KERNELS = {
     "project_backward": "projection, SH backward",
     "frame_adam": "Adam",
     "adam_step": "Adam",
+    "observe_gradients": "density statistics",
+    "scale_colors": "light",
 }
-STATISTICS, CONTROL = "density statistics", "density control"
-AROUND_LOSS, REST = "light, PSNR", "other Python and torch"
-ORDER = (*dict.fromkeys(KERNELS.values()), STATISTICS, CONTROL, AROUND_LOSS, REST)
+CONTROL = "density control"
+AROUND_LOSS, REST = "PSNR", "other Python and torch"
+ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, AROUND_LOSS, REST)
 Seconds = dict[str, float]
 
 
@@ -114,9 +116,7 @@ class Run:
         state.adam.resize_bands(options.sh_degree)
         state.step = state.clock = clock
         self.trainer = trainer = Trainer(scene, state, run, backend)
-        density, engine = state.density, trainer.engine
-        timed = self.phases.timed
-        vars(density)["before_step"] = timed(STATISTICS, density.before_step)
+        engine, timed = trainer.engine, self.phases.timed
         vars(trainer)["control_density"] = timed(CONTROL, trainer.control_density)
         colors = vars(engine)["color_loss"]
         vars(engine)["color_loss"] = SimpleNamespace(gradients=timed(AROUND_LOSS, colors.gradients))

@@ -195,6 +195,31 @@ class Backend(ABC, Generic[Projected, Binned]):
         almost zero norm are not updated. Axes and scales are those before the step.
         """
 
+    def observe_gradients(
+        self,
+        rendered: Forward,
+        gradients: Gradients,
+        gradient_sum: Tensor,
+        seen: Tensor,
+        threads: int = 0,
+    ) -> None:
+        """Add a step to the statistics of density control (``Strategy.statistics``), in place.
+
+        Args:
+            gradient_sum: (N,) float32; the norms of the gradients of the projected centres, in
+                normalised device coordinates, are added.
+            seen: (N,) float32; 1 is added for visible Gaussians.
+        """
+        height, width = rendered.alpha.shape
+        # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
+        scale = gradients.means2d.new_tensor([0.5 * width, 0.5 * height])
+        gradient_sum += (gradients.means2d * scale).double().norm(dim=1).float()
+        seen += rendered.radii > 0
+
+    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
+        """The product of ``image`` (H, W, 3) and ``factor`` (3,) or (H, W, 3), float32."""
+        return image * factor
+
     def forward(
         self,
         means: Tensor,

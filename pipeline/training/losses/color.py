@@ -54,7 +54,7 @@ class ColorLoss:
         if around is not None:
             color = self.backend.compose(around, color, rendered.alpha, self.threads)
         if factor is not None:
-            color = color * factor
+            color = self.backend.scale_colors(color, factor, self.threads)
         loss = self.backend.l1_ssim(
             color,
             image,
@@ -64,7 +64,9 @@ class ColorLoss:
             self.threads,
         )
         psnr = target.psnr(color, image) if measures_psnr else None
-        d_color, d_alpha = loss.grad if factor is None else loss.grad * factor, None
+        d_color, d_alpha = loss.grad, None
+        if factor is not None:
+            d_color = self.backend.scale_colors(d_color, factor, self.threads)
         if around is not None:
             d_color, d_alpha = self.backend.compose_backward(
                 around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads

@@ -43,6 +43,11 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     loss = backend.l1_ssim(fwd.color, target, 0.2, mask, 2.5, threads)
     found |= {"loss": torch.tensor([loss.loss, loss.error, loss.ssim]), "d_color": loss.grad}
 
+    for name, shape in (("uniform", (3,)), ("shading", fwd.color.shape)):
+        factor = torch.rand(shape, generator=draws)
+        found[name] = backend.scale_colors(fwd.color, factor, threads)
+        assert torch.equal(found[name], fwd.color * factor)
+
     around = random_surroundings(301, 403, front=True, correction=True)
     change = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
     found["composed"] = backend.compose(around, fwd.color, fwd.alpha, threads)
@@ -55,6 +60,11 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     found |= {f"d_{name}": getattr(g, name) for name in GRADIENTS}
     assert g.camera is not None
     found |= {f"camera.{name}": tensor for name, tensor in vars(g.camera).items()}
+    found["observed"] = observed = torch.rand(2, COUNT, generator=draws)
+    expected = observed.clone()
+    backend.observe_gradients(fwd, g, *observed, threads)
+    make_backend("reference").observe_gradients(fwd, g, *expected)
+    assert torch.allclose(observed, expected, rtol=1e-6)
     sh_adam = ShAdam(sh_moments, last, AdamRates((1e-2, 1e-3), 3))
     backend.backward(fwd, loss.grad, sh_adam=sh_adam)
     found |= {"sh": sh, "sh.first": sh_moments.exp_avg, "sh.second": sh_moments.exp_avg_sq}

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from pipeline.config.density import Gradient, Mcmc, Original
 from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
 from pipeline.config.settled import TrainOptions
+from pipeline.render import make_backend
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
 from pipeline.training.density import DensityStep, Strategy, make_strategy
@@ -345,8 +346,11 @@ def test_gradients_are_measured_in_normalised_device_coordinates() -> None:
     means2d = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
     gradients = SimpleNamespace(means2d=means2d)
     rendered = SimpleNamespace(radii=torch.ones(2), alpha=torch.zeros(100, 200))
-    density.before_step(ball(2, 0), rendered, gradients)  # type: ignore[arg-type]
-    assert torch.allclose(density.observed.gradient_sum, torch.tensor([3e-4, 2e-4]))
+    for backend in map(make_backend, ("cpu", "reference")):
+        density.start(2)
+        backend.observe_gradients(rendered, gradients, *density.statistics, 1)  # type: ignore[arg-type,misc]
+        assert torch.allclose(density.observed.gradient_sum, torch.tensor([3e-4, 2e-4]))
+        assert density.observed.seen.tolist() == [1.0, 1.0]
 
 
 def test_the_published_strategy_prunes_after_it_densifies() -> None:

@@ -15,6 +15,7 @@
 #include "loss.h"
 #include "memory.h"
 #include "project.h"
+#include "step.h"
 #include "surroundings.h"
 
 namespace {
@@ -242,6 +243,20 @@ std::tuple<Tensor, Tensor> compose_backward(const Tensor& behind, const Tensor& 
     return {d_color, d_alpha};
 }
 
+void observe_gradients(const Tensor& means2d, const Tensor& radii, const Tensor& gradient_sum,
+                       const Tensor& seen, double scale_x, double scale_y, int64_t threads) {
+    splat::observe_gradients(floats(means2d), floats(radii), scale_x, scale_y, radii.numel(),
+                             int(threads), mutable_floats(gradient_sum), mutable_floats(seen));
+}
+
+// (H, W, 3) image
+Tensor scale_colors(const Tensor& image, const Tensor& factor, int64_t threads) {
+    Tensor scaled = new_floats({image.size(0), image.size(1), 3});
+    splat::scale_colors(floats(image), floats(factor), factor.numel(), image.numel(), int(threads),
+                        mutable_floats(scaled));
+    return scaled;
+}
+
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                const Tensor& exp_avg_sq, const Tensor& adam, int64_t threads) {
     const splat::AdamSettings settings = settings_from(adam);
@@ -301,6 +316,10 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor alpha, Tensor d_image, float weight, float fade, float growth, int threads) -> "
         "(Tensor, Tensor)");
     m.def(
+        "observe_gradients(Tensor means2d, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) seen, "
+        "float scale_x, float scale_y, int threads) -> ()");
+    m.def("scale_colors(Tensor image, Tensor factor, int threads) -> Tensor");
+    m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor adam, int threads) -> ()");
     m.def(
@@ -321,6 +340,8 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
     m.impl("compose", TORCH_BOX(&compose));
     m.impl("compose_backward", TORCH_BOX(&compose_backward));
+    m.impl("observe_gradients", TORCH_BOX(&observe_gradients));
+    m.impl("scale_colors", TORCH_BOX(&scale_colors));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }

@@ -160,17 +160,17 @@ def medians(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> list[Seconds]:
 
 
 def results(
-    scene: str, threads: int, one: Mapping[str, float], many: Mapping[str, float], control: float
+    scene: str, threads: int, times: Sequence[Mapping[str, float]], control: float
 ) -> list[SerialResult]:
-    """A result for each phase and the step."""
-    one, many = ({**of, STEP: sum(of.values())} for of in (one, many))
+    """A result for each phase and the step, of the times on one thread and on several."""
+    one, many = ({**phases, STEP: sum(phases.values())} for phases in times)
     return [
         SerialResult(scene, threads, phase, one[phase], many[phase], one[STEP], control)
         for phase in (*ORDER, STEP)
     ]
 
 
-def made_inputs(gaussians: Gaussians, views: Sequence[View]) -> Inputs:
+def made_inputs(gaussians: Gaussians, views: list[View]) -> Inputs:
     """The inputs, with light that differs between the photographs as in real scenes."""
     light = [ViewLight(gain=(1 + 0.01 * k, 1.0, 1 - 0.01 * k)) for k in range(len(views))]
     return Inputs(views, gaussians, scene_extent(views), light=light)
@@ -204,7 +204,7 @@ def main() -> int:
                 ratios.append(calibration.flops(args.threads) / calibration.flops(1))
             repeats.append(turns)
     scene = f"{args.gaussians} at {args.size[0]}x{args.size[1]}"
-    found = results(scene, args.threads, *medians(repeats), statistics.median(ratios))
+    found = results(scene, args.threads, medians(repeats), statistics.median(ratios))
     print(f"{serial_table(found)}\n{forecast_table(found)}")
     if args.json is not None:
         write_record(args.json, measured("serial", args.note), found)

@@ -176,6 +176,8 @@ class _StoredTarget:
 
 def usable_factor(views: Sequence[View], factor: int) -> int:
     """``factor``, halved until every reduced view has ``MIN_SHORT_SIDE`` pixels, or until 1."""
+    if factor == 1:  # Most steps: the views need not be searched.
+        return 1
     shortest = min(min(view.width, view.height) for view in views)
     while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
         factor //= 2

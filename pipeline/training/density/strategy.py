@@ -98,8 +98,8 @@ class Strategy:
 
     @property
     def statistics(self) -> tuple[Tensor, Tensor] | None:
-        """The tensors ``gradient_sum`` and ``seen`` (``Backend.observe_gradients``), if the strategy
-        observes nothing else in a step, so that a backend can do it; else None."""
+        """``gradient_sum`` and ``seen`` of ``Backend.observe_gradients``, if the strategy observes
+        nothing else in a step, so that a backend can do it; else None."""
         return None
 
     def is_due(self, steps: range) -> bool:

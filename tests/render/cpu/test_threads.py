@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
@@ -96,6 +99,25 @@ def test_every_operator_has_the_same_bits_at_1_to_64_threads() -> None:
 def test_more_threads_than_processors_change_nothing(threads: int) -> None:
     expected = draw(1)
     assert all(draw(threads) == expected for _ in range(5))
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the system lists no threads")
+def test_threads_without_work_sleep() -> None:
+    """They look out for the next loop for some milliseconds only."""
+    draw(8)
+    deadline = time.monotonic() + 20
+    while "R" in thread_states():
+        assert time.monotonic() < deadline, "threads of the kernels keep a processor busy"
+        time.sleep(0.05)
+
+
+def thread_states() -> list[str]:
+    """The states of the other threads of this process: R while one runs or waits for a
+    processor."""
+    tasks, own = Path("/proc/self/task"), str(threading.get_native_id())
+    stats = [(task / "stat").read_text() for task in tasks.iterdir() if task.name != own]
+    assert len(stats) >= 7
+    return [stat.rpartition(")")[2].split()[0] for stat in stats]
 
 
 def test_callers_on_several_threads_at_once_change_nothing() -> None:

@@ -56,10 +56,10 @@ KERNELS = {
     "adam_step": "Adam",
     "observe_gradients": "density statistics",
     "scale_colors": "light",
+    "mean_squared_error": "PSNR",
 }
-CONTROL = "density control"
-AROUND_LOSS, REST = "PSNR", "other Python and torch"
-ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, AROUND_LOSS, REST)
+CONTROL, REST = "density control", "other Python and torch"
+ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, REST)
 Seconds = dict[str, float]
 
 
@@ -116,10 +116,8 @@ class Run:
         state.adam.resize_bands(options.sh_degree)
         state.step = state.clock = clock
         self.trainer = trainer = Trainer(scene, state, run, backend)
-        engine, timed = trainer.engine, self.phases.timed
+        timed = self.phases.timed
         vars(trainer)["control_density"] = timed(CONTROL, trainer.control_density)
-        colors = vars(engine)["color_loss"]
-        vars(engine)["color_loss"] = SimpleNamespace(gradients=timed(AROUND_LOSS, colors.gradients))
         self._step = timed(REST, trainer.step)
 
     def turn(self) -> Seconds:

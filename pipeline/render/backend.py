@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 from pipeline.render import checks
@@ -137,6 +138,18 @@ class Backend(ABC, Generic[Projected, Binned]):
             l2_weight: k >= 0.
             threads: The number of threads, 0 for all.
         """
+
+    def mean_squared_error(
+        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
+    ) -> float:
+        """The mean squared error of the images of ``l1_ssim`` without ignored pixels; 0 if all
+        are ignored."""
+        rendered, target, mask = checks.images(rendered, target, mask)
+        scale = 255.0 if target.dtype == torch.uint8 else 1.0
+        difference = rendered.double() - (target.float() / scale).double()
+        if mask is not None:
+            difference = difference[mask == 0]
+        return float(difference.square().mean()) if difference.numel() else 0.0
 
     @abstractmethod
     def compose(

@@ -201,6 +201,12 @@ class CpuBackend(Backend[Projected, Binned]):
         images = checks.images(rendered, target, mask)
         return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
 
+    def mean_squared_error(
+        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
+    ) -> float:
+        images = checks.images(rendered, target, mask)
+        return float(_ops().mean_squared_error(*images, _threads(threads)))
+
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
     ) -> Tensor:

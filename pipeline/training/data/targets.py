@@ -53,14 +53,6 @@ class Target:
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
-    def psnr(self, rendered: Tensor, image: Tensor) -> float:
-        """PSNR in dB of ``rendered`` (H, W, 3) and ``over``'s image, without ignored pixels."""
-        scale = 1 / 255.0 if image.dtype == torch.uint8 else 1.0
-        difference = rendered - image.to(torch.float32) * scale
-        if self.ignored is not None:
-            difference = difference[~self.ignored]
-        return psnr_of(float(difference.square().mean()) if difference.numel() else 0.0)
-
 
 def psnr_of(squared_error: float) -> float:
     """PSNR in dB of a mean squared error of values in [0, 1]."""

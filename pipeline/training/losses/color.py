@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pipeline.render import Backend, Forward
 from pipeline.training.data.step_view import StepView
+from pipeline.training.data.targets import psnr_of
 from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
 
 
@@ -63,7 +64,10 @@ class ColorLoss:
             self.squared_error_weight,
             self.threads,
         )
-        psnr = target.psnr(color, image) if measures_psnr else None
+        psnr = None
+        if measures_psnr:
+            error = self.backend.mean_squared_error(color, image, target.ignored, self.threads)
+            psnr = psnr_of(error)
         d_color, d_alpha = loss.grad, None
         if factor is not None:
             d_color = self.backend.scale_colors(d_color, factor, self.threads)

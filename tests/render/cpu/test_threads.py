@@ -46,6 +46,12 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     loss = backend.l1_ssim(fwd.color, target, 0.2, mask, 2.5, threads)
     found |= {"loss": torch.tensor([loss.loss, loss.error, loss.ssim]), "d_color": loss.grad}
 
+    images = ((target, mask), (target, None), (target / 255.0, mask))
+    errors = [backend.mean_squared_error(fwd.color, *of, threads=threads) for of in images]
+    found["errors"] = torch.tensor(errors, dtype=torch.float64)
+    reference = make_backend("reference")
+    expected = [reference.mean_squared_error(fwd.color, *of) for of in images]
+    assert errors == pytest.approx(expected, rel=1e-9)
     for name, shape in (("uniform", (3,)), ("shading", fwd.color.shape)):
         factor = torch.rand(shape, generator=draws)
         found[name] = backend.scale_colors(fwd.color, factor, threads)
@@ -64,10 +70,10 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     assert g.camera is not None
     found |= {f"camera.{name}": tensor for name, tensor in vars(g.camera).items()}
     found["observed"] = observed = torch.rand(2, COUNT, generator=draws)
-    expected = observed.clone()
+    statistics = observed.clone()
     backend.observe_gradients(fwd, g, *observed, threads)
-    make_backend("reference").observe_gradients(fwd, g, *expected)
-    assert torch.allclose(observed, expected, rtol=1e-6)
+    reference.observe_gradients(fwd, g, *statistics)
+    assert torch.allclose(observed, statistics, rtol=1e-6)
     sh_adam = ShAdam(sh_moments, last, AdamRates((1e-2, 1e-3), 3))
     backend.backward(fwd, loss.grad, sh_adam=sh_adam)
     found |= {"sh": sh, "sh.first": sh_moments.exp_avg, "sh.second": sh_moments.exp_avg_sq}

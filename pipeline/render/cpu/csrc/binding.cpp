@@ -192,18 +192,31 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera};
 }
 
+splat::LossImages images_from(const Tensor& rendered, const Tensor& target,
+                              const OptionalTensor& mask) {
+    const bool bytes = target.scalar_type() == ScalarType::Byte;
+    return {rendered.size(1),
+            rendered.size(0),
+            floats(rendered),
+            bytes ? nullptr : floats(target),
+            bytes ? target.const_data_ptr<uint8_t>() : nullptr,
+            mask ? mask->const_data_ptr<uint8_t>() : nullptr};
+}
+
 // loss, error, ssim, (H, W, 3) gradient
 std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
                                                    OptionalTensor mask, double ssim_weight,
                                                    double l2_weight, int64_t threads) {
-    const bool bytes = target.scalar_type() == ScalarType::Byte;
     Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
-    const splat::LossValues values = splat::l1_ssim(
-        {rendered.size(1), rendered.size(0), floats(rendered), bytes ? nullptr : floats(target),
-         bytes ? target.const_data_ptr<uint8_t>() : nullptr,
-         mask ? mask->const_data_ptr<uint8_t>() : nullptr},
-        {ssim_weight, l2_weight}, int(threads), mutable_floats(grad));
+    const splat::LossValues values =
+        splat::l1_ssim(images_from(rendered, target, mask), {ssim_weight, l2_weight}, int(threads),
+                       mutable_floats(grad));
     return {values.loss, values.error, values.ssim, grad};
+}
+
+double mean_squared_error(const Tensor& rendered, const Tensor& target, OptionalTensor mask,
+                          int64_t threads) {
+    return splat::mean_squared_error(images_from(rendered, target, mask), int(threads));
 }
 
 splat::Surroundings surroundings_from(const Tensor& behind, const Tensor& alpha,
@@ -308,6 +321,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, "
         "float l2_weight, int threads) -> (float, float, float, Tensor)");
+    m.def("mean_squared_error(Tensor rendered, Tensor target, Tensor? mask, int threads) -> float");
     m.def(
         "compose(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
         "Tensor? correction, Tensor color, Tensor alpha, int threads) -> Tensor");
@@ -338,6 +352,7 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("blend_backward", TORCH_BOX(&blend_backward));
     m.impl("project_backward", TORCH_BOX(&project_backward));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
+    m.impl("mean_squared_error", TORCH_BOX(&mean_squared_error));
     m.impl("compose", TORCH_BOX(&compose));
     m.impl("compose_backward", TORCH_BOX(&compose_backward));
     m.impl("observe_gradients", TORCH_BOX(&observe_gradients));

@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "loss.h"
+
 namespace splat {
 
 // Adds to gradient_sum (rows) the norm of means2d (rows, 2) times (scale_x, scale_y), and to seen
@@ -14,5 +16,8 @@ void observe_gradients(const float* means2d, const float* radii, double scale_x,
 // is repeated: 3 for one colour, or one for each value.
 void scale_colors(const float* image, const float* factors, int64_t period, int64_t values,
                   int threads, float* scaled);
+
+// The mean of the squared differences of the images over the unmasked values; 0 if there are none.
+double mean_squared_error(const LossImages& images, int threads);
 
 }  // namespace splat

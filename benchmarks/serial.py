@@ -65,6 +65,7 @@ ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, REST)
 Seconds = dict[str, float]
 # The time that other programs ran in a turn, over its wall time. Turns below the limit are quiet.
 OTHERS, QUIET = "other programs", 0.04
+SAMPLE = 0.5  # seconds for which other programs are watched before a turn
 
 
 class Phases:
@@ -141,14 +142,20 @@ def busy_seconds() -> float:
 
 
 def once(
-    inputs: Inputs, options: TrainOptions, threads: Sequence[int], turns: int
+    inputs: Inputs,
+    options: TrainOptions,
+    threads: Sequence[int],
+    turns: int,
+    wait: Callable[[], None],
 ) -> Iterator[list[Seconds]]:
-    """The seconds of each turn after the first, at each number of threads."""
+    """The seconds of each turn after the first, at each number of threads. ``wait`` is called
+    before each turn."""
     with TemporaryDirectory() as folder:
         clock = options.steps // 3 // 100 * 100 + 50
         runs = [Run(inputs, options, Path(folder), number, clock) for number in threads]
         for turn in range(turns + 1):
             # In alternating order: what runs second has the other's data in the cache.
+            wait()
             order = runs if turn % 2 else runs[::-1]
             seconds = {id(run): run.turn() for run in order}
             if turn:
@@ -169,6 +176,17 @@ def medians(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> list[Seconds]:
                 phases[phase] += 1e3 * statistics.median(here) / TURN / len(repeats[0])
         found.append(phases)
     return found
+
+
+def wait_for_quiet(seconds: float) -> float:
+    """Wait until other programs hardly run, for ``seconds`` at most; return the seconds left."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        busy = busy_seconds()
+        time.sleep(SAMPLE)
+        if busy_seconds() - busy < QUIET * SAMPLE:
+            return left
+    return 0.0
 
 
 def quiet_share(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> float:
@@ -234,14 +252,22 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=2, help="against one thread")
     parser.add_argument("--steps", type=int, default=200, help="of each trainer and repeat")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--wait", type=float, default=0.0, help="seconds to wait in all until other programs pause"
+    )
     add_record_options(parser)
     args = parser.parse_args()
     options = TrainOptions(density=Gradient(max_gaussians=args.gaussians))
-    control, repeats = Control(args.threads), []
+    control, repeats, left = Control(args.threads), [], args.wait
+
+    def wait() -> None:
+        nonlocal left
+        left = wait_for_quiet(left)
+
     with made_scene(args.gaussians, *args.size) as inputs, single_torch_thread():
         for _ in range(args.repeats):
             turns = []
-            for turn in once(inputs, options, (1, args.threads), args.steps // TURN):
+            for turn in once(inputs, options, (1, args.threads), args.steps // TURN, wait):
                 turns.append(turn)
                 control.measure()
             repeats.append(turns)

@@ -2,8 +2,9 @@
 
     python -m benchmarks.serial --gaussians 200000 --size 640 400 --json FILE
 
-Trains a synthetic scene from the middle of the schedule, with density control, by two trainers in
-turns: one on one thread, the other on ``--threads``. Both compute the same bits, so that each turn
+Trains a synthetic scene from the middle of the schedule, with density control, by trainers in
+turns: on one thread, on ``--threads``, and on one thread while other processes do the same, so that
+all threads are busy. All compute the same bits, so that each turn
 is the same work, and so is each repeat of the whole measurement. Times are medians over the repeats
 of a turn in which other programs took less than 4 % of one core, or the repeat in which they took
 least. Kernels are timed one by one. The rest of a step, in Python and torch, runs on one thread.
@@ -12,6 +13,7 @@ least. Kernels are timed one by one. The rest of a step, in Python and torch, ru
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import statistics
 import sys
@@ -19,6 +21,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from multiprocessing.synchronize import Barrier, Event
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -29,7 +32,6 @@ import torch
 
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.memory import made_gaussians, made_views
-from benchmarks.raster.peak import Calibration
 from benchmarks.record_tables import forecast_table, serial_table
 from benchmarks.results import STEP, SerialResult
 from pipeline.config.density import Gradient
@@ -97,15 +99,9 @@ class Phases:
 
 
 class Run:
-    """A trainer whose steps are measured.
+    """A trainer whose steps are measured, from a third of the schedule on."""
 
-    Args:
-        clock: The step of the schedule at which it begins.
-    """
-
-    def __init__(
-        self, inputs: Inputs, options: TrainOptions, folder: Path, threads: int, clock: int
-    ) -> None:
+    def __init__(self, inputs: Inputs, options: TrainOptions, folder: Path, threads: int) -> None:
         run = TrainingRun(options, folder, threads=threads)
         backend, self.phases = make_backend("cpu"), Phases()
         self._operators = SimpleNamespace(
@@ -119,18 +115,21 @@ class Run:
         state = initial_state(scene, run, backend, print)
         state.gaussians = state.gaussians.with_sh_degree(options.sh_degree)
         state.adam.resize_bands(options.sh_degree)
-        state.step = state.clock = clock
+        state.step = state.clock = options.steps // 3
         self.trainer = trainer = Trainer(scene, state, run, backend)
         timed = self.phases.timed
         vars(trainer)["control_density"] = timed(CONTROL, trainer.control_density)
-        self._step = timed(REST, trainer.step)
+        self._timed_step = timed(REST, trainer.step)
+
+    def step(self) -> None:
+        with mock.patch.object(cpu, "_ops", lambda: self._operators):
+            self._timed_step()
 
     def turn(self) -> Seconds:
         """Run ``TURN`` steps, and return the seconds of each phase."""
         start, busy = time.perf_counter(), busy_seconds()
-        with mock.patch.object(cpu, "_ops", lambda: self._operators):
-            for _ in range(TURN):
-                self._step()
+        for _ in range(TURN):
+            self.step()
         others = (busy_seconds() - busy) / (time.perf_counter() - start)
         return self.phases.take() | {OTHERS: others}
 
@@ -144,22 +143,25 @@ def busy_seconds() -> float:
 def once(
     inputs: Inputs,
     options: TrainOptions,
-    threads: Sequence[int],
+    copies: Copies,
+    threads: int,
     turns: int,
     wait: Callable[[], None],
 ) -> Iterator[list[Seconds]]:
-    """The seconds of each turn after the first, at each number of threads. ``wait`` is called
-    before each turn."""
+    """The seconds of each turn after the first: on one thread, on ``threads``, and on one thread
+    beside the copies. ``wait`` is called before each turn."""
     with TemporaryDirectory() as folder:
-        clock = options.steps // 3 // 100 * 100 + 50
-        runs = [Run(inputs, options, Path(folder), number, clock) for number in threads]
+        one, many, beside = (
+            Run(inputs, options, Path(folder), number) for number in (1, threads, 1)
+        )
         for turn in range(turns + 1):
-            # In alternating order: what runs second has the other's data in the cache.
             wait()
-            order = runs if turn % 2 else runs[::-1]
-            seconds = {id(run): run.turn() for run in order}
+            seconds = [one.turn(), many.turn()]
+            with copies.running():
+                seconds.append(beside.turn())
+            seconds[-1][OTHERS] -= threads - 1
             if turn:
-                yield [seconds[id(run)] for run in runs]
+                yield seconds
 
 
 def medians(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> list[Seconds]:
@@ -195,37 +197,55 @@ def quiet_share(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> float:
     return sum(every) / len(every)
 
 
-class Control:
-    """A loop of multiply-adds in registers, on several threads: what the machine gives to them."""
+class Copies:
+    """Other processes that train the same scene on one thread each: with this one, a perfectly
+    parallel program of the same arithmetic without shared state.
 
-    def __init__(self, threads: int) -> None:
-        self.calibration, self.threads = Calibration(), threads
-        self._ratios: list[tuple[float, float]] = []
+    Args:
+        count: The number of processes.
+        arguments: Those of ``copy``.
+    """
 
-    def measure(self) -> None:
-        """Compare the wall time of the loop on one thread and on all."""
-        seconds, busy = [], busy_seconds()
-        for threads in (1, self.threads):
-            start = time.perf_counter()
-            for _ in range(3):
-                self.calibration.flops(threads)
-            seconds.append(time.perf_counter() - start)
-        others = (busy_seconds() - busy) / sum(seconds)
-        self._ratios.append((others, self.threads * seconds[0] / seconds[1]))
+    def __init__(self, count: int, arguments: tuple[int, int, int]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._go, started = context.Event(), context.Barrier(count + 1)
+        self._processes = [
+            context.Process(target=copy, args=(*arguments, self._go, started), daemon=True)
+            for _ in range(count)
+        ]
+        for process in self._processes:
+            process.start()
+        started.wait()
 
-    def speed_up(self) -> float:
-        """The median of the quieter half of the measurements."""
-        quiet = sorted(self._ratios)[: (len(self._ratios) + 1) // 2]
-        return statistics.median(ratio for _, ratio in quiet)
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Let them train inside."""
+        self._go.set()
+        yield
+        self._go.clear()
+        time.sleep(SAMPLE)  # Their steps end.
 
 
-def results(
-    scene: str, threads: int, times: Sequence[Mapping[str, float]], control: float
-) -> list[SerialResult]:
-    """A result for each phase and the step, of the times on one thread and on several."""
-    one, many = ({**phases, STEP: sum(phases.values())} for phases in times)
+def copy(count: int, width: int, height: int, go: Event, started: Barrier) -> None:
+    """Train while ``go`` is set."""
+    torch.set_num_threads(1)
+    with made_scene(count, width, height) as inputs, TemporaryDirectory() as folder:
+        run = Run(inputs, made_options(count), Path(folder), 1)
+        started.wait()
+        while True:
+            go.wait()
+            run.step()
+
+
+def made_options(count: int) -> TrainOptions:
+    return TrainOptions(density=Gradient(max_gaussians=count))
+
+
+def results(scene: str, threads: int, times: Sequence[Mapping[str, float]]) -> list[SerialResult]:
+    """A result for each phase and the step, of the times in the order of ``SerialResult``."""
+    one, many, beside = ({**phases, STEP: sum(phases.values())} for phases in times)
     return [
-        SerialResult(scene, threads, phase, one[phase], many[phase], one[STEP], control)
+        SerialResult(scene, threads, phase, one[phase], many[phase], beside[phase], one[STEP])
         for phase in (*ORDER, STEP)
     ]
 
@@ -257,22 +277,20 @@ def main() -> int:
     )
     add_record_options(parser)
     args = parser.parse_args()
-    options = TrainOptions(density=Gradient(max_gaussians=args.gaussians))
-    control, repeats, left = Control(args.threads), [], args.wait
+    repeats, left = [], args.wait
+    options, made = made_options(args.gaussians), (args.gaussians, *args.size)
+    copies = Copies(args.threads - 1, made)
 
     def wait() -> None:
         nonlocal left
         left = wait_for_quiet(left)
 
-    with made_scene(args.gaussians, *args.size) as inputs, single_torch_thread():
+    with made_scene(*made) as inputs, single_torch_thread():
         for _ in range(args.repeats):
-            turns = []
-            for turn in once(inputs, options, (1, args.threads), args.steps // TURN, wait):
-                turns.append(turn)
-                control.measure()
-            repeats.append(turns)
+            turns = once(inputs, options, copies, args.threads, args.steps // TURN, wait)
+            repeats.append(list(turns))
     scene = f"{args.gaussians} at {args.size[0]}x{args.size[1]}"
-    found = results(scene, args.threads, medians(repeats), control.speed_up())
+    found = results(scene, args.threads, medians(repeats))
     print(f"{serial_table(found)}\n{forecast_table(found)}")
     print(f"quiet: {quiet_share(repeats):.0%} of the turns")
     if args.json is not None:

@@ -18,6 +18,7 @@ from benchmarks.markdown import cell
 from benchmarks.measured import Record
 from benchmarks.results import (
     GEOREFERENCE_VERDICTS,
+    STEP,
     BlocksResult,
     BudgetResult,
     FileResult,
@@ -32,6 +33,7 @@ from benchmarks.results import (
     PoseOutcome,
     PoseResult,
     ScalingResult,
+    SerialResult,
     SlurmResult,
     StabilityResult,
     StressResult,
@@ -307,6 +309,36 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
     return markdown.table(rows)
 
 
+def serial_table(found: Sequence[SerialResult]) -> str:
+    """The times of each phase, and the serial part by Amdahl's law."""
+    rows = [
+        [
+            *("Gaussians", "phase", "1 thread (ms)", "n threads (ms)", "n", "speed-up"),
+            *("1 thread beside copies (ms)", "serial, of the step", "serial against copies"),
+        ]
+    ]
+    for r in found:
+        times = (f"{r.one_ms:.2f}", f"{r.many_ms:.2f}", str(r.threads))
+        speed_up = f"{r.one_ms / r.many_ms:.2f}" if r.many_ms else ""
+        shares = (f"{r.share:.1%}", f"{r.code_share:.1%}")
+        rows.append([r.scene, r.phase, *times, speed_up, f"{r.beside_ms:.2f}", *shares])
+    return markdown.table(rows)
+
+
+def forecast_table(found: Sequence[SerialResult]) -> str:
+    """The speed-up of a step on more cores by Amdahl's law."""
+    cores = (4, 16, 64)
+    rows = [["Gaussians", "serial part", "of the step", *(f"{n} cores" for n in cores)]]
+    for r in found:
+        if r.phase != STEP:
+            continue
+        for name, share in (("of all", r.share), ("against copies", r.code_share)):
+            serial = max(0.0, share)
+            speed_ups = (f"{1 / (serial + (1 - serial) / n):.1f}" for n in cores)
+            rows.append([r.scene, name, f"{share:.1%}", *speed_ups])
+    return markdown.table(rows)
+
+
 #: Kind of table -> the type of the results in its records, and the function that makes the table.
 TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "card": (card.CardResult, card.table),
@@ -328,6 +360,8 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),
+    "serial": (SerialResult, serial_table),
+    "serial_forecast": (SerialResult, forecast_table),
     "slurm": (SlurmResult, slurm_table),
     "files": (FileResult, files_table),
 }

@@ -553,3 +553,45 @@ class PoseResult:
     outcome: PoseOutcome
     text: str
     seconds: float
+
+
+# ---- benchmarks.serial ----
+
+STEP = "step"
+
+
+@dataclass(frozen=True)
+class SerialResult:
+    """A phase of a training step on one thread and on several.
+
+    Attributes:
+        phase: ``STEP`` for the sum of all phases.
+        one_ms, many_ms: The time of the phase in a step, on one thread and on ``threads``.
+        beside_ms: The time on one thread while the other threads run copies of the program, with
+            which it shares memory bandwidth and caches, but no state.
+        step_ms: The time of the step on one thread.
+    """
+
+    scene: str
+    threads: int
+    phase: str
+    one_ms: float
+    many_ms: float
+    beside_ms: float
+    step_ms: float
+
+    def serial_ms(self, alone: float) -> float:
+        """The serial part by Amdahl's law, T(n) = serial + (T(1) - serial) / n, where T(1) is the
+        time ``alone``."""
+        return (self.threads * self.many_ms - alone) / (self.threads - 1)
+
+    @property
+    def share(self) -> float:
+        """The serial part over the step, both on one thread alone."""
+        return self.serial_ms(self.one_ms) / self.step_ms
+
+    @property
+    def code_share(self) -> float:
+        """The same without what threads lose to each other's memory traffic: against the time
+        beside the copies."""
+        return self.serial_ms(self.beside_ms) / self.step_ms

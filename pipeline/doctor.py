@@ -111,7 +111,7 @@ def _python() -> list[Finding]:
 def _processor() -> list[Finding]:
     cores, usable = os.cpu_count() or 1, machine.usable_cores()
     text = f"{processor.processor_name()}, {processor.architecture()}, {platform.system()}"
-    found = [Finding("processor", text), Finding("cores", f"{cores}, {usable} of them usable")]
+    found = [Finding("processor", text), Finding("cores", f"{cores} logical, {usable} used")]
     has = [t.name for t in targets.of_this_architecture() if not t.missing]
     text = f"the processor has {', '.join(has) or 'none of the targets'}"
     try:

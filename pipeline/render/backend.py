@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 from pipeline.render import checks
@@ -138,6 +139,18 @@ class Backend(ABC, Generic[Projected, Binned]):
             threads: The number of threads, 0 for all.
         """
 
+    def mean_squared_error(
+        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
+    ) -> float:
+        """The mean squared error of the images of ``l1_ssim`` without ignored pixels; 0 if all
+        are ignored."""
+        rendered, target, mask = checks.images(rendered, target, mask)
+        scale = 255.0 if target.dtype == torch.uint8 else 1.0
+        difference = rendered.double() - (target.float() / scale).double()
+        if mask is not None:
+            difference = difference[mask == 0]
+        return float(difference.square().mean()) if difference.numel() else 0.0
+
     @abstractmethod
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
@@ -194,6 +207,31 @@ class Backend(ABC, Generic[Projected, Binned]):
         in its plane. Steps are equivariant under rotation and scaling of the world. Quaternions of
         almost zero norm are not updated. Axes and scales are those before the step.
         """
+
+    def observe_gradients(
+        self,
+        rendered: Forward,
+        gradients: Gradients,
+        gradient_sum: Tensor,
+        seen: Tensor,
+        threads: int = 0,
+    ) -> None:
+        """Add a step to the statistics of density control (``Strategy.statistics``), in place.
+
+        Args:
+            gradient_sum: (N,) float32; the norms of the gradients of the projected centres, in
+                normalised device coordinates, are added.
+            seen: (N,) float32; 1 is added for visible Gaussians.
+        """
+        height, width = rendered.alpha.shape
+        # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
+        scale = gradients.means2d.new_tensor([0.5 * width, 0.5 * height])
+        gradient_sum += (gradients.means2d * scale).double().norm(dim=1).float()
+        seen += rendered.radii > 0
+
+    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
+        """The product of ``image`` (H, W, 3) and ``factor`` (3,) or (H, W, 3), float32."""
+        return image * factor
 
     def forward(
         self,

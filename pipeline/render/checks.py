@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -64,8 +66,8 @@ def check_camera(camera: RasterCamera, near: float) -> None:
     pose = camera.world_to_camera.detach()
     if pose.shape != (4, 4):
         raise ValueError(f"world_to_camera: expected (4, 4), found {tuple(pose.shape)}")
-    values = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, near], dtype=torch.float64)
-    if not bool(values.isfinite().all() and pose[:3].isfinite().all()):
+    values = camera.fx, camera.fy, camera.cx, camera.cy, near
+    if not all(map(math.isfinite, values)) or not bool(pose[:3].isfinite().all()):
         raise ValueError("camera: every value must be finite")
     if not (camera.fx > 0 and camera.fy > 0):
         raise ValueError(f"camera: focal lengths must be positive, found {camera.fx}, {camera.fy}")
@@ -180,8 +182,9 @@ def check_frame_adam(
 
 
 def _check_rates(operator: str, rates: AdamRates, count: int | None = None) -> None:
-    found = torch.tensor([*rates.rates, rates.beta1, rates.beta2, rates.eps], dtype=torch.float64)
-    if rates.step < 1 or not found.isfinite().all():
+    if rates.step < 1 or not all(
+        map(math.isfinite, (*rates.rates, rates.beta1, rates.beta2, rates.eps))
+    ):
         raise ValueError(
             f"{operator}: step {rates.step} must be at least 1 and lr {rates.lr} finite"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -32,12 +33,40 @@ def machine_facts() -> dict[str, Any]:
     }
 
 
-def usable_cores() -> int:
-    """The number of logical cores that this process may run on; batch systems and taskset can
-    restrict it."""
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def usable_cores(root: Path = Path("/")) -> int:
+    """The number of processor cores that this process may use. The threads of one core count once:
+    the kernels fill its units with one. Batch systems and taskset restrict the cores, and so do the
+    limits of a Linux control group, such as a container's ``--cpus``.
+
+    Args:
+        root: The folder of /proc and /sys.
+    """
+    if not hasattr(os, "sched_getaffinity"):  # macOS
+        return os.cpu_count() or 1
+    cores = {_threads_of_core(cpu, root) for cpu in os.sched_getaffinity(0)}
+    quotas = [int(quota) for quota in _cpu_quotas(root)]
+    return max(1, min([len(cores), *quotas]))
+
+
+def _threads_of_core(cpu: int, root: Path) -> str:
+    """The logical processors of the core of one of them, such as "0,4"."""
+    try:
+        topology = root / f"sys/devices/system/cpu/cpu{cpu}/topology"
+        return (topology / "thread_siblings_list").read_text()
+    except OSError:
+        return str(cpu)
+
+
+def _cpu_quotas(root: Path) -> Iterator[float]:
+    """The processors' time over wall time that this process's control groups allow."""
+    for folder in _control_groups("cpu", root):
+        with suppress(OSError, ValueError):  # missing, or "max"
+            quota, period = (folder / "cpu.max").read_text().split()
+            yield int(quota) / int(period)
+        with suppress(OSError, ValueError):
+            limit = int((folder / "cpu.cfs_quota_us").read_text())
+            if limit > 0:  # -1: no limit
+                yield limit / int((folder / "cpu.cfs_period_us").read_text())
 
 
 def physical_memory() -> int:
@@ -66,20 +95,27 @@ def usable_memory(root: Path = Path("/")) -> int:
         root: The folder of /proc and /sys.
     """
     limits = [physical_memory()]
+    for folder in _control_groups("memory", root):
+        for name in ("memory.max", "memory.limit_in_bytes"):
+            with suppress(OSError, ValueError):  # missing, or "max"
+                limits.append(int((folder / name).read_text()))
+    return min(limits)
+
+
+def _control_groups(controller: str, root: Path) -> Iterator[Path]:
+    """The folders of this process's Linux control groups of a controller and of their parents,
+    version 1 or 2."""
     try:
         groups = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
-        groups = []
+        return
     for line in groups:
         _, controllers, path = line.split(":", 2)
         if not controllers:
-            folder, name = root / "sys/fs/cgroup", "memory.max"
-        elif "memory" in controllers.split(","):
-            folder, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+            folder = root / "sys/fs/cgroup"
+        elif controller in controllers.split(","):
+            folder = root / "sys/fs/cgroup" / controller
         else:
             continue
         inside = PurePosixPath(path.lstrip("/"))
-        for place in (inside, *inside.parents):
-            with suppress(OSError, ValueError):  # missing, or "max"
-                limits.append(int((folder / place / name).read_text()))
-    return min(limits)
+        yield from (folder / place for place in (inside, *inside.parents))

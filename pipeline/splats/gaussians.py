@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.splats.arrays import Array, GaussianArrays
+from pipeline.splats.rows import take_rows
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -93,9 +94,12 @@ class Gaussians:
 
         return Gaussians(*(torch.from_numpy(array) for array in arrays.arrays().values()))
 
-    def select(self, which: Tensor) -> Gaussians:
+    def select(self, which: Tensor, threads: int = 1) -> Gaussians:
         """Copies of the Gaussians selected by a boolean mask (N,) or int64 indices (M,)."""
-        return Gaussians(**{k: v[which].contiguous() for k, v in self.tensors().items()})
+        import torch
+
+        rows = torch.nonzero(which)[:, 0] if which.dtype == torch.bool else which
+        return Gaussians(**take_rows(self.tensors(), rows, threads))
 
     def first(self, count: int) -> Gaussians:
         """The first Gaussians, in tensors that share their memory with these."""

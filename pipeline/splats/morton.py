@@ -10,9 +10,9 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.z_order import z_order
 
 
-def morton_order(means: Tensor) -> Tensor:
+def morton_order(means: Tensor, threads: int = 1) -> Tensor:
     """(N,) int64 indices that sort ``means`` (N, 3) as ``z_order``."""
-    return torch.from_numpy(z_order(means.detach().numpy()))
+    return torch.from_numpy(z_order(means.detach().numpy(), threads))
 
 
 def in_morton_order(gaussians: Gaussians) -> Gaussians:

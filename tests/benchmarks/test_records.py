@@ -27,6 +27,7 @@ from benchmarks.results import (
     NovelViewResult,
     PoseResult,
     ScalingResult,
+    SerialResult,
     SlurmResult,
     StabilityResult,
     StressResult,
@@ -99,6 +100,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "scaling": (
         ScalingResult("town", 125, "features", 3, 60.4, 30.6, 210.0, 12.2),
         "| features | 3 | 60 | 20 | 31 | 210 | 12 | - | - |",
+    ),
+    "serial": (
+        SerialResult("9 at 4x3", 2, "bin", 10.0, 5.25, 10.3, 40.0),
+        "| 9 at 4x3 | bin | 10.00 | 5.25 | 2 | 1.90 | 10.30 | 1.2% | 0.5% |",
     ),
     "slurm": (
         SlurmResult("demo", 2, blocks=4, jobs=12, wall_s=150.4, busy_s=110.0, blocks_s=70.0),
@@ -222,7 +227,7 @@ def test_a_missing_record_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 def test_every_table_is_of_a_benchmark() -> None:
-    assert set(record_tables.TABLES) - {"budget-curves"} == set(EXAMPLES)
+    assert set(record_tables.TABLES) - {"budget-curves", "serial_forecast"} == set(EXAMPLES)
     for benchmark in EXAMPLES:
         assert benchmark in KINDS
         assert importlib.util.find_spec(f"benchmarks.{benchmark}") is not None

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import torch
 
-from pipeline.render import RasterCamera, RasterOptions, reference
+from pipeline.render import RasterCamera, RasterOptions, Surroundings, reference
 from pipeline.splats.init import SH_C0
 
 Scene = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
@@ -37,6 +37,23 @@ def random_scene(seed: int, count: int, *, degree: int = 3, size: float = 0.07) 
     log_scales = normal(count, 3) * 0.5 + torch.tensor(size).log()
     sh = normal(count, (degree + 1) ** 2, 3) * 0.25
     return means, log_scales, normal(count, 4), normal(count) * 1.5, sh
+
+
+def random_surroundings(height: int, width: int, front: bool, correction: bool) -> Surroundings:
+    """Random layers around a block."""
+    torch.manual_seed(0)
+
+    def plane(*channels: int) -> torch.Tensor:
+        return torch.randint(0, 256, (height, width, *channels), dtype=torch.uint8)
+
+    signed = torch.randint(-127, 128, (height, width, 3), dtype=torch.int8)
+    return Surroundings(
+        plane(3),
+        plane(),
+        plane(3) if front else None,
+        plane() if front else None,
+        signed if correction else None,
+    )
 
 
 def relative(found: torch.Tensor, expected: torch.Tensor) -> float:

@@ -18,7 +18,7 @@ from pipeline.render import (
     Surroundings,
     make_backend,
 )
-from tests.render.scenes import NAMES, Scene, camera, random_scene
+from tests.render.scenes import NAMES, Scene, camera, random_scene, random_surroundings
 
 REFERENCE = make_backend("reference")
 CAMERA = camera(31, 22, rotated=True)
@@ -60,22 +60,6 @@ def test_a_subset_has_the_image_of_its_gaussians_alone(any_backend: Backend, sce
         assert torch.equal(found.radii[which], alone.radii)
         assert not found.radii[~which].any()
         assert found.num_visible == alone.num_visible
-
-
-def random_surroundings(height: int, width: int, front: bool, correction: bool) -> Surroundings:
-    torch.manual_seed(0)
-
-    def plane(*channels: int) -> torch.Tensor:
-        return torch.randint(0, 256, (height, width, *channels), dtype=torch.uint8)
-
-    signed = torch.randint(-127, 128, (height, width, 3), dtype=torch.int8)
-    return Surroundings(
-        plane(3),
-        plane(),
-        plane(3) if front else None,
-        plane() if front else None,
-        signed if correction else None,
-    )
 
 
 @pytest.mark.parametrize("front", [False, True])

@@ -1,4 +1,4 @@
-"""How much memory there is, where a control group says less than the machine has."""
+"""Memory and cores of a process whose control groups have less than the machine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,23 @@ from pathlib import Path
 import pytest
 
 from pipeline.runtime import machine
-from pipeline.runtime.machine import physical_memory, threads_within, usable_memory
+from pipeline.runtime.machine import (
+    physical_memory,
+    threads_within,
+    usable_cores,
+    usable_memory,
+)
+
+
+def write_groups(root: Path, group: str | None, limits: dict[str, str]) -> None:
+    """Write the control group of the process, and files of control groups."""
+    if group is not None:
+        (root / "proc/self").mkdir(parents=True)
+        (root / "proc/self/cgroup").write_text(group + "\n")
+    for name, value in limits.items():
+        path = root / "sys/fs/cgroup" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(value + "\n")
 
 
 @pytest.mark.parametrize(
@@ -40,14 +56,36 @@ from pipeline.runtime.machine import physical_memory, threads_within, usable_mem
 def test_the_least_limit_counts(
     tmp_path: Path, group: str | None, limits: dict[str, str], wanted: int | None
 ) -> None:
-    if group is not None:
-        (tmp_path / "proc/self").mkdir(parents=True)
-        (tmp_path / "proc/self/cgroup").write_text(group + "\n")
-    for name, value in limits.items():
-        path = tmp_path / "sys/fs/cgroup" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(value + "\n")
+    write_groups(tmp_path, group, limits)
     assert usable_memory(tmp_path) == (physical_memory() if wanted is None else wanted)
+
+
+@pytest.mark.parametrize(
+    ("group", "limits", "wanted"),
+    [
+        ("0::/", {"cpu.max": "350000 100000"}, 3),
+        ("0::/", {"cpu.max": "max 100000"}, 8),
+        ("0::/", {"cpu.max": "50000 100000"}, 1),
+        ("0::/job/step", {"job/step/cpu.max": "max 100000", "job/cpu.max": "200000 100000"}, 2),
+        (
+            "3:cpu,cpuacct:/docker/a",
+            {"cpu/docker/a/cpu.cfs_quota_us": "400000", "cpu/docker/a/cpu.cfs_period_us": "100000"},
+            4,
+        ),
+        ("3:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 8),
+        ("0::/", {"cpu.max": "what is this"}, 8),
+    ],
+)
+def test_a_limit_of_processor_time_limits_the_cores(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    group: str,
+    limits: dict[str, str],
+    wanted: int,
+) -> None:
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    write_groups(tmp_path, group, limits)
+    assert usable_cores(tmp_path) == wanted
 
 
 @pytest.mark.parametrize(

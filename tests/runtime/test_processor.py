@@ -82,9 +82,15 @@ def test_a_system_that_says_nothing_has_the_baseline(tmp_path, monkeypatch, arch
     assert processor.features() == processor.BASELINE[processor.architecture()]
 
 
-def test_cores_are_those_that_may_be_used(monkeypatch):
+def test_cores_are_those_that_may_be_used(monkeypatch, tmp_path):
     monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 3, 5}, raising=False)
-    assert machine.usable_cores() == 3
+    assert machine.usable_cores(tmp_path) == 3
+    # Two of them are threads of one core.
+    for cpu, siblings in ((0, "0,3"), (3, "0,3"), (5, "2,5")):
+        topology = tmp_path / f"sys/devices/system/cpu/cpu{cpu}/topology"
+        topology.mkdir(parents=True)
+        (topology / "thread_siblings_list").write_text(siblings + "\n")
+    assert machine.usable_cores(tmp_path) == 2
     monkeypatch.delattr(machine.os, "sched_getaffinity")
     monkeypatch.setattr(machine.os, "cpu_count", lambda: 7)
     assert machine.usable_cores() == 7

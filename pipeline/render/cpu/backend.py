@@ -201,6 +201,12 @@ class CpuBackend(Backend[Projected, Binned]):
         images = checks.images(rendered, target, mask)
         return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
 
+    def mean_squared_error(
+        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
+    ) -> float:
+        images = checks.images(rendered, target, mask)
+        return float(_ops().mean_squared_error(*images, _threads(threads)))
+
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
     ) -> Tensor:
@@ -223,6 +229,28 @@ class CpuBackend(Backend[Projected, Binned]):
             around.behind, around.alpha, around.front, around.transmittance, alpha, d_image,
             loss.weight, loss.fade, loss.growth, _threads(threads),
         )  # fmt: skip
+
+    def observe_gradients(
+        self,
+        rendered: Forward,
+        gradients: Gradients,
+        gradient_sum: Tensor,
+        seen: Tensor,
+        threads: int = 0,
+    ) -> None:
+        rows = len(rendered.radii)
+        means2d = checks.checked("means2d", gradients.means2d, (rows, 2))
+        for name, tensor in (("gradient_sum", gradient_sum), ("seen", seen)):
+            checks.checked(name, tensor, (rows,))
+        height, width = rendered.alpha.shape
+        tensors = means2d, rendered.radii, gradient_sum, seen
+        _ops().observe_gradients(*tensors, 0.5 * width, 0.5 * height, _threads(threads))
+
+    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
+        image = checks.checked("image", image, (None, None, 3))
+        shape = (3,) if factor.dim() == 1 else tuple(image.shape)
+        factor = checks.checked("factor", factor, shape)
+        return _ops().scale_colors(image, factor, _threads(threads))
 
     def adam_step(
         self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0

@@ -53,14 +53,6 @@ class Target:
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
-    def psnr(self, rendered: Tensor, image: Tensor) -> float:
-        """PSNR in dB of ``rendered`` (H, W, 3) and ``over``'s image, without ignored pixels."""
-        scale = 1 / 255.0 if image.dtype == torch.uint8 else 1.0
-        difference = rendered - image.to(torch.float32) * scale
-        if self.ignored is not None:
-            difference = difference[~self.ignored]
-        return psnr_of(float(difference.square().mean()) if difference.numel() else 0.0)
-
 
 def psnr_of(squared_error: float) -> float:
     """PSNR in dB of a mean squared error of values in [0, 1]."""
@@ -176,6 +168,8 @@ class _StoredTarget:
 
 def usable_factor(views: Sequence[View], factor: int) -> int:
     """``factor``, halved until every reduced view has ``MIN_SHORT_SIDE`` pixels, or until 1."""
+    if factor == 1:  # Most steps: the views need not be searched.
+        return 1
     shortest = min(min(view.width, view.height) for view in views)
     while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
         factor //= 2

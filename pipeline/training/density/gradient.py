@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.experiments import GradientExperiments
-from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
 from pipeline.training.density.growth import (
@@ -83,9 +82,6 @@ class GradientDensity(Strategy):
     def start(self, count: int) -> None:
         self.observed.start(count)
 
-    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
-        self.observed.observe(rendered, gradients)
-
     def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
         """Prune, then split."""
         kept = ~self._useless(step)
@@ -118,7 +114,7 @@ class GradientDensity(Strategy):
         if any(map(self.prunes_large_after, step.steps)):
             large = longest_scale(gaussians) > self.options.prune_scale * self.scale
             useless |= large & ~self._sky(gaussians, step.adam)
-        return useless | not_finite(gaussians)
+        return useless | not_finite(gaussians, step.threads)
 
     def _sky(self, gaussians: Gaussians, adam: Adam) -> Tensor:
         if self.sky is None:

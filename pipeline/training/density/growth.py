@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.strategy import Changes, DensityStep, rotations
 from pipeline.training.optimisers.adam import Adam
@@ -40,14 +39,6 @@ class GradientStatistics:
 
     def start(self, count: int) -> None:
         self.gradient_sum, self.seen = torch.zeros(count), torch.zeros(count)
-
-    def observe(self, rendered: Forward, gradients: Gradients) -> None:
-        height, width = rendered.alpha.shape
-        # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
-        self.gradient_sum += torch.hypot(
-            gradients.means2d[:, 0] * (0.5 * width), gradients.means2d[:, 1] * (0.5 * height)
-        )
-        self.seen += rendered.radii > 0
 
     def mean(self) -> Tensor:
         """(N,) mean norm of the gradient over the steps in which the Gaussian was visible."""
@@ -84,9 +75,11 @@ def multiply(step: DensityStep, kept: Tensor, cloned: Tensor, split: Tensor) -> 
     stay = torch.nonzero(kept & ~split)[:, 0]
     changes.cloned, changes.split = len(clones), len(halves)
     rows = torch.cat([stay, clones, halves, halves])
-    step.adam.select(rows, torch.arange(len(rows)) >= len(stay))
+    step.adam.select(rows, torch.arange(len(rows)) >= len(stay), step.threads)
     return Multiplied(
-        step.gaussians.select(rows), slice(len(stay) + len(clones), len(rows)), changes
+        step.gaussians.select(rows, step.threads),
+        slice(len(stay) + len(clones), len(rows)),
+        changes,
     )
 
 

@@ -101,14 +101,14 @@ class McmcDensity(Strategy):
         densification, remove them. Large Gaussians are left to the regulariser."""
         gaussians, adam = step.gaussians, step.adam
         useless = torch.sigmoid(gaussians.opacity_logits) <= self.options.prune_opacity
-        useless |= not_finite(gaussians)
+        useless |= not_finite(gaussians, step.threads)
         alive = torch.nonzero(~useless)[:, 0]
         dead = int(useless.sum())
         opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double()
         weights = opacity.masked_fill(adam.frozen[alive], 0.0).numpy()
         if not self.densifies_after(step.steps) or not weights.any():
-            adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
-            return gaussians.select(alive), Changes(pruned=dead)
+            adam.select(alive, torch.zeros(len(alive), dtype=torch.bool), step.threads)
+            return gaussians.select(alive, step.threads), Changes(pruned=dead)
         grown = min(step.budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
         added = max(0, grown - len(gaussians))
         chosen = step.rng.choice(len(alive), size=dead + added, p=weights / weights.sum())
@@ -127,8 +127,8 @@ class McmcDensity(Strategy):
             for tensor in moments.values():
                 tensor[rows] = 0.0
         order = torch.cat([alive, sources])
-        adam.select(order, torch.arange(len(order)) >= len(alive))
-        return shared.select(order), Changes(cloned=added, relocated=dead)
+        adam.select(order, torch.arange(len(order)) >= len(alive), step.threads)
+        return shared.select(order, step.threads), Changes(cloned=added, relocated=dead)
 
 
 def share_out(logits: Tensor, parts: Tensor, min_opacity: float) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.growth import (
     GradientStatistics,
@@ -84,9 +83,6 @@ class OriginalDensity(Strategy):
     def start(self, count: int) -> None:
         self.observed.start(count)
 
-    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
-        self.observed.observe(rendered, gradients)
-
     def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
         """Split and clone, then prune."""
         every = torch.ones(len(step.gaussians), dtype=torch.bool)
@@ -103,11 +99,11 @@ class OriginalDensity(Strategy):
         useless = torch.sigmoid(gaussians.opacity_logits) < MIN_OPACITY
         if any(map(self.prunes_large_after, step.steps)):
             useless |= longest_scale(gaussians) > MAX_SCALE * self.extent
-        alive = torch.nonzero(~(useless | not_finite(gaussians)))[:, 0]
+        alive = torch.nonzero(~(useless | not_finite(gaussians, step.threads)))[:, 0]
         changes.pruned = len(gaussians) - len(alive)
-        step.adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
+        step.adam.select(alive, torch.zeros(len(alive), dtype=torch.bool), step.threads)
         self.start(len(alive))
-        return gaussians.select(alive), changes
+        return gaussians.select(alive, step.threads), changes
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
         limit_opacity(gaussians, adam)

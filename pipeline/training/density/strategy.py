@@ -1,8 +1,8 @@
 """The interface of density strategies.
 
-``OperatorStep`` calls ``before_step`` after the backward pass. ``Trainer.control_density`` calls
-``after_step`` after the update of the parameters, if ``is_due``. On a GPU, ``DeviceStep``
-accumulates ``statistics`` in place of ``before_step``.
+After the backward pass, the backend accumulates ``statistics``; ``before_step`` is called for a
+strategy that has none. ``Trainer.control_density`` calls ``after_step`` after the update of the
+parameters, if ``is_due``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.rows import for_ranges
 from pipeline.training.density.timeline import Timeline
 from pipeline.training.optimisers.adam import Adam
 
@@ -55,6 +56,7 @@ class DensityStep:
         noise_rate: The learning rate of the means over its initial value, times the run's factor.
         budget: The upper limit of the number of Gaussians.
         prune: Whether to prune even if the timeline does not say so.
+        threads: The number of threads that search and copy Gaussians.
     """
 
     gaussians: Gaussians
@@ -64,6 +66,7 @@ class DensityStep:
     noise_rate: float = 1.0
     budget: int = 1_000_000_000
     prune: bool = False
+    threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,8 @@ class Strategy:
 
     @property
     def statistics(self) -> tuple[Tensor, Tensor] | None:
-        """The tensors ``gradient_sum`` and ``seen`` (``render.resident.Optimised``), if
-        ``before_step`` does no more than accumulate them, so that a device can do it; else None."""
+        """``gradient_sum`` and ``seen`` of ``Backend.observe_gradients``, if the strategy observes
+        nothing else in a step, so that a backend can do it; else None."""
         return None
 
     def is_due(self, steps: range) -> bool:
@@ -151,11 +154,16 @@ class Strategy:
         """Restore the state that ``arrays()`` returned; other keys are ignored."""
 
 
-def not_finite(gaussians: Gaussians) -> Tensor:
+def not_finite(gaussians: Gaussians, threads: int = 1) -> Tensor:
     """(N,) bool: rows with a value that is not finite."""
     bad = torch.zeros(len(gaussians), dtype=torch.bool)
-    for tensor in gaussians.tensors().values():
-        bad |= ~torch.isfinite(tensor).reshape(len(tensor), tensor[:1].numel()).all(1)
+
+    def find(rows: slice) -> None:
+        for tensor in gaussians.tensors().values():
+            part = tensor[rows]
+            bad[rows] |= ~torch.isfinite(part).reshape(len(part), part[:1].numel()).all(1)
+
+    for_ranges(len(gaussians), threads, find)
     return bad
 
 
@@ -163,11 +171,13 @@ def highest(score: Tensor, among: Tensor, count: int) -> Tensor:
     """(N,) bool: rows with the ``count`` highest scores ``among`` (N,) bool, the first of ties."""
     if int(among.sum()) <= count:
         return among
-    chosen = torch.zeros_like(among)
-    if count > 0:
-        lowest = torch.full_like(score, -torch.inf)
-        order = torch.argsort(score.where(among, lowest), descending=True, stable=True)
-        chosen[order[:count]] = True
+    if count <= 0:
+        return torch.zeros_like(among)
+    # A partition: sorting all scores would take most of the time of density control.
+    last = float(np.partition(score[among].numpy(), -count)[-count])
+    chosen = among & (score > last)
+    ties = torch.nonzero(among & (score == last))[:, 0]
+    chosen[ties[: count - int(chosen.sum())]] = True
     return chosen
 
 

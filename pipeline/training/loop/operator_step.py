@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.render import Backend, Gradients, RasterOptions
+from pipeline.render import Backend, Forward, Gradients, RasterOptions
 from pipeline.training.data.step_view import StepView
 from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
@@ -57,13 +57,23 @@ class OperatorStep(StepEngine):
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
         self._update_cameras(step, gradients)
-        state.density.before_step(gaussians, rendered, gradients)
+        self._observe(rendered, gradients)
         state.adam.step(gaussians, gradients, step.adam, self.run.threads)
         return [
             StepResult(
                 state.step, color.loss, color.psnr, rendered.num_visible, rendered.num_dropped
             )
         ]
+
+    def _observe(self, rendered: Forward, gradients: Gradients) -> None:
+        """Let density control observe the step."""
+        density = self.state.density
+        if density.statistics is None:
+            density.before_step(self.state.gaussians, rendered, gradients)
+        else:
+            self.backend.observe_gradients(
+                rendered, gradients, *density.statistics, self.run.threads
+            )
 
     def results(self) -> Sequence[StepResult]:
         """There are none: ``step`` returns the result of each step."""

@@ -115,13 +115,13 @@ class TrainState:
             self.window.psnr += psnr
             self.window.samples += 1
 
-    def reorder(self) -> None:
+    def reorder(self, threads: int) -> None:
         """Sort Gaussians along a Z-order curve: neighbours in space become neighbours in memory,
         and the rasterizer skips invisible ones in blocks. Only right after ``refine``, when the
         strategy has no statistics of single Gaussians."""
-        order = morton_order(self.gaussians.means)
-        self.gaussians = self.gaussians.select(order)
-        self.adam.select(order, torch.zeros(len(order), dtype=torch.bool))
+        order = morton_order(self.gaussians.means, threads)
+        self.gaussians = self.gaussians.select(order, threads)
+        self.adam.select(order, torch.zeros(len(order), dtype=torch.bool), threads)
 
     def drop_unseen(self, views: int, sky: Sky | None) -> None:
         """At the end, remove Gaussians without a gradient in a whole epoch of ``views`` views: no

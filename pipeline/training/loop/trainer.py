@@ -176,12 +176,13 @@ class Trainer:
                     noise_rate=rate,
                     budget=budget,
                     prune=faded > 0,
+                    threads=self.run.threads,
                 )
             )
         )
         if changed:
             with freed_memory():
-                state.reorder()
+                state.reorder(self.run.threads)
             if not len(state.gaussians):
                 raise UserError(
                     f"no Gaussian is left at step {state.step}: all became transparent",

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pipeline.render import Backend, Forward
 from pipeline.training.data.step_view import StepView
+from pipeline.training.data.targets import psnr_of
 from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
 
 
@@ -54,7 +55,7 @@ class ColorLoss:
         if around is not None:
             color = self.backend.compose(around, color, rendered.alpha, self.threads)
         if factor is not None:
-            color = color * factor
+            color = self.backend.scale_colors(color, factor, self.threads)
         loss = self.backend.l1_ssim(
             color,
             image,
@@ -63,8 +64,13 @@ class ColorLoss:
             self.squared_error_weight,
             self.threads,
         )
-        psnr = target.psnr(color, image) if measures_psnr else None
-        d_color, d_alpha = loss.grad if factor is None else loss.grad * factor, None
+        psnr = None
+        if measures_psnr:
+            error = self.backend.mean_squared_error(color, image, target.ignored, self.threads)
+            psnr = psnr_of(error)
+        d_color, d_alpha = loss.grad, None
+        if factor is not None:
+            d_color = self.backend.scale_colors(d_color, factor, self.threads)
         if around is not None:
             d_color, d_alpha = self.backend.compose_backward(
                 around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads

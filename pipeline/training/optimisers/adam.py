@@ -23,6 +23,7 @@ from pipeline.render import (
     make_backend,
 )
 from pipeline.splats.gaussians import Gaussians, resize_bands
+from pipeline.splats.rows import take_rows
 
 BETA2 = 0.999
 # As in 3DGS: gradients of a mean over all pixels are far below the usual 1e-8.
@@ -152,12 +153,13 @@ class Adam:
                     parameter, gradient, self.moments(name), rates[name], threads
                 )
 
-    def select(self, rows: Tensor, fresh: Tensor) -> None:
+    def select(self, rows: Tensor, fresh: Tensor, threads: int = 1) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""
-        for moments in (self.first, self.second):
-            for name, tensor in moments.items():
-                moments[name] = tensor[rows].contiguous()
-                moments[name][fresh] = 0.0
+        zeroed = torch.nonzero(fresh)[:, 0]
+        self.first = take_rows(self.first, rows, threads)
+        self.second = take_rows(self.second, rows, threads)
+        for tensor in (*self.first.values(), *self.second.values()):
+            tensor.index_fill_(0, zeroed, 0.0)
         self.last = self.last[rows]
 
     @property

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from pipeline.config.density import Gradient, Mcmc, Original
 from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
 from pipeline.config.settled import TrainOptions
+from pipeline.render import make_backend
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
 from pipeline.training.density import DensityStep, Strategy, make_strategy
@@ -28,7 +29,7 @@ from pipeline.training.density.growth import (
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
-from pipeline.training.density.strategy import rotations
+from pipeline.training.density.strategy import highest, rotations
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
 
@@ -345,8 +346,11 @@ def test_gradients_are_measured_in_normalised_device_coordinates() -> None:
     means2d = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
     gradients = SimpleNamespace(means2d=means2d)
     rendered = SimpleNamespace(radii=torch.ones(2), alpha=torch.zeros(100, 200))
-    density.before_step(ball(2, 0), rendered, gradients)  # type: ignore[arg-type]
-    assert torch.allclose(density.observed.gradient_sum, torch.tensor([3e-4, 2e-4]))
+    for backend in map(make_backend, ("cpu", "reference")):
+        density.start(2)
+        backend.observe_gradients(rendered, gradients, *density.statistics, 1)  # type: ignore[arg-type,misc]
+        assert torch.allclose(density.observed.gradient_sum, torch.tensor([3e-4, 2e-4]))
+        assert density.observed.seen.tolist() == [1.0, 1.0]
 
 
 def test_the_published_strategy_prunes_after_it_densifies() -> None:
@@ -367,3 +371,19 @@ def test_the_published_strategy_prunes_after_it_densifies() -> None:
     scales = result.log_scales.exp()[:, 0]
     assert torch.allclose(scales, torch.tensor([0.009, 0.009, 0.0125, 0.0125]))
     assert len(density.observed.gradient_sum) == len(adam.first["means"]) == 4
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([-1e9, -1.0, -0.0, 0.0, 0.5, 7.0, math.inf]), st.booleans())
+    ),
+    st.integers(-1, 12),
+)
+def test_the_highest_scores_are_the_first_of_a_stable_sort(
+    rows: list[tuple[float, bool]], count: int
+) -> None:
+    score = torch.tensor([score for score, _ in rows], dtype=torch.float32)
+    among = torch.tensor([candidate for _, candidate in rows], dtype=torch.bool)
+    ranked = sorted(torch.nonzero(among)[:, 0].tolist(), key=lambda row: -score[row].item())
+    expected = sorted(ranked[: max(0, count)])
+    assert torch.nonzero(highest(score, among, count))[:, 0].tolist() == expected

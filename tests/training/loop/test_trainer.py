@@ -20,7 +20,7 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
 from pipeline.scene.exposure import ViewLight
-from pipeline.scene.views import View
+from pipeline.scene.views import View, resized
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import InitGaussians
 from pipeline.splats.skybox import NUM_GAUSSIANS, with_skybox
@@ -32,7 +32,7 @@ from pipeline.training.loop import metrics_log, session, setup
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
 from pipeline.training.run import Part, TrainingRun
-from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
+from tests.training.conftest import HEIGHT, WIDTH, TinyScene, ball, tiny_config
 
 
 def run(
@@ -290,14 +290,30 @@ def test_a_checkpoint_of_other_settings_is_not_used(
 
 
 def test_threads_do_not_change_the_bits(scene: TinyScene, tmp_path: Path) -> None:
+    """At up to 64 threads, in a scene of more ranges of Gaussians and tiles than most of them get,
+    through density control, a rise of the SH degree and camera refinement."""
+    views = []
+    for view in scene.views:
+        with Image.open(view.image) as small:
+            picture = small.resize((4 * WIDTH, 4 * HEIGHT), Image.Resampling.BICUBIC)
+        picture.save(tmp_path / view.name)
+        at_size = resized(view, 4 * WIDTH, 4 * HEIGHT)
+        views.append(replace(at_size, image=str(tmp_path / view.name)))
+    large = replace(scene, initial=ball(8000, 7))
+    config = tiny_config(16, density={"max_gaussians": 9000}, refine_poses=True)
     before = torch.get_num_threads()
-    one = run(scene, tmp_path / "1", views=scene.alpha_views, threads=1)
-    two = run(scene, tmp_path / "2", views=scene.alpha_views, threads=2)
-    assert_same(one, two)
-    assert torch.get_num_threads() == before
+    found = {
+        threads: run(large, tmp_path / str(threads), config, views=views, threads=threads)
+        for threads in (1, 2, 4, 16, 64)
+    }
+    one = found.pop(1)
+    assert one.counters["max_gaussians"] > len(large.initial) and one.gaussians.sh_degree == 1
     write_npz(tmp_path / "1.npz", one.gaussians)
-    write_npz(tmp_path / "2.npz", two.gaussians)
-    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+    for threads, other in found.items():
+        assert_same(one, other)
+        write_npz(tmp_path / "other.npz", other.gaussians)
+        assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "other.npz").read_bytes(), threads
+    assert torch.get_num_threads() == before
 
 
 def test_ignored_pixels_have_no_influence(scene: TinyScene, tmp_path: Path) -> None:

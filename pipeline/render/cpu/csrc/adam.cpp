@@ -16,6 +16,10 @@ constexpr float kLnUnitMax = 28.0f;
 // Gradients are clamped to this, so that their squares are finite in float32.
 constexpr float kGradientMax = 1e18f;
 
+// Gaussians of a range in groups, and vectors of a range: some microseconds of work, so that small
+// scenes have ranges for many threads.
+constexpr int64_t kGroupsPerRange = 64, kVectorsPerRange = 256;
+
 constexpr float kLog2E = 1.4426950408889634f;
 
 // Squared norm of a quaternion above which the square of a component may overflow float32.
@@ -38,7 +42,7 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
     const float rate = float(s.rates[0] * correct.to_rate), eps = float(s.eps);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2);
     const float rest1 = float(1 - s.beta1), rest2 = float((1 - s.beta2) / K);
-    parallel_for((rows + kGroup - 1) / kGroup, 256, threads, [&](int64_t number) {
+    parallel_for((rows + kGroup - 1) / kGroup, kGroupsPerRange, threads, [&](int64_t number) {
         const int64_t first = kGroup * number;
         const int count = int(rows - first < kGroup ? rows - first : kGroup);
         f32x16 p[K], g[K], m[K], squares = {};
@@ -76,7 +80,7 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
              (sqrt(v) * correct.to_root + eps);
     };
     const int64_t vectors = count / 16;
-    parallel_for(vectors, 1024, threads, [&](int64_t k) {
+    parallel_for(vectors, kVectorsPerRange, threads, [&](int64_t k) {
         const int64_t i = 16 * k;
         f32x16 p = load<f32x16>(param + i), m = load<f32x16>(exp_avg + i);
         f32x16 v = load<f32x16>(exp_avg_sq + i);
@@ -123,7 +127,7 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
         write_rows(m, count, exp_avg);
         write_rows(v, count, exp_avg_sq);
     };
-    parallel_for((rows + kGroup - 1) / kGroup, 256, threads, [&](int64_t number) {
+    parallel_for((rows + kGroup - 1) / kGroup, kGroupsPerRange, threads, [&](int64_t number) {
         const int64_t first = kGroup * number;
         const int count = int(rows - first < kGroup ? rows - first : kGroup);
         f32x16 mean[3], d_mean[3], q[4], d_quat[4], log2_scale[3], scale[3];

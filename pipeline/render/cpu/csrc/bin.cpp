@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstring>
+#include <utility>
 
 #include "shuffle.h"
 #include "threads.h"
@@ -12,6 +13,9 @@ namespace {
 
 // Number of parts for each thread: visible Gaussians are distributed unevenly.
 constexpr int kPartsPerThread = 4;
+
+// Number of tiles whose pairs are summed at a time: some cache lines of counts.
+constexpr int64_t kSummedTiles = 128;
 
 // Number of columns of cells tested at a time, one bit each.
 constexpr int kColumns = 32;
@@ -243,17 +247,31 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
     return intersections_ <= kMaxIntersections;
 }
 
-void Binner::write(Entry* entries, int64_t* tile_begin) {
+void Binner::place_pairs(int64_t* tile_begin) {
+    // The counts of all parts grow with the number of threads: their sum over the tiles before each
+    // range, by range, and then the places in each.
+    std::vector<int64_t> before((tiles_ + kSummedTiles - 1) / kSummedTiles, 0);
+    parallel_ranges(tiles_, kSummedTiles, threads_, [&](int64_t begin, int64_t end) {
+        int64_t pairs = 0;
+        for (const Part& part : parts_)
+            for (int64_t tile = begin; tile < end; tile++) pairs += part.tile_count[tile];
+        before[begin / kSummedTiles] = pairs;
+    });
     int64_t total = 0;
-    for (int64_t tile = 0; tile < tiles_; tile++) {
-        tile_begin[tile] = total;
-        for (Part& part : parts_) {
-            const uint32_t here = part.tile_count[tile];
-            part.tile_count[tile] = uint32_t(total);
-            total += here;
+    for (int64_t& pairs : before) total += std::exchange(pairs, total);
+    parallel_ranges(tiles_, kSummedTiles, threads_, [&](int64_t begin, int64_t end) {
+        int64_t place = before[begin / kSummedTiles];
+        for (int64_t tile = begin; tile < end; tile++) {
+            tile_begin[tile] = place;
+            for (Part& part : parts_)
+                place += std::exchange(part.tile_count[tile], uint32_t(place));
         }
-    }
+    });
     tile_begin[tiles_] = total;
+}
+
+void Binner::write(Entry* entries, int64_t* tile_begin) {
+    place_pairs(tile_begin);
     const Scratch<TilePair> by_tile(intersections_);
     const int parts = int(parts_.size());
     std::vector<uint32_t> first(parts, 0);

@@ -29,8 +29,9 @@ class Binner {
     struct Found {
         uint32_t tile, depth, gaussian, blocks;
     };
-    // A contiguous range of Gaussians.
-    struct Part {
+    // A contiguous range of Gaussians. Threads change the numbers of neighbouring parts at once:
+    // each part has cache lines of its own.
+    struct alignas(64) Part {
         int64_t begin, end;
         Scratch<Found> found;
         int64_t used = 0, capacity = 0;
@@ -38,6 +39,9 @@ class Binner {
 
         void make_room(int64_t pairs_more);
     };
+
+    // Replaces the counts of each tile by the first places of the parts' pairs in the tile's list.
+    void place_pairs(int64_t* tile_begin);
 
     int threads_ = 1;
     int64_t tiles_ = 0, intersections_ = 0;

@@ -13,6 +13,7 @@
 #include "loss.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <vector>
 
@@ -301,11 +302,15 @@ class Strip {
 };
 
 // Number of unmasked values.
-int64_t count_values(const LossImages& in) {
+int64_t count_values(const LossImages& in, int threads) {
     const int64_t pixels = in.width * in.height;
     if (!in.mask) return 3 * pixels;
-    int64_t counted = 0;
-    for (int64_t i = 0; i < pixels; i++) counted += in.mask[i] == 0;
+    std::atomic<int64_t> counted{0};
+    parallel_ranges(pixels, 1 << 16, threads, [&](int64_t begin, int64_t end) {
+        int64_t here = 0;
+        for (int64_t i = begin; i < end; i++) here += in.mask[i] == 0;
+        counted += here;
+    });
     return 3 * counted;
 }
 
@@ -313,7 +318,7 @@ int64_t count_values(const LossImages& in) {
 
 LossValues l1_ssim(const LossImages& in, const LossWeights& weights, int threads, float* grad) {
     const Window window;
-    const int64_t values = 3 * in.width, height = in.height, count = count_values(in);
+    const int64_t values = 3 * in.width, height = in.height, count = count_values(in, threads);
     if (count == 0) {
         std::memset(grad, 0, height * values * sizeof(float));
         return {0, 0, 1};

@@ -1,8 +1,8 @@
 #include <cmath>
 #include <cstring>
-#include <vector>
 
 #include "group.h"
+#include "memory.h"
 #include "project.h"
 #include "threads.h"
 
@@ -120,7 +120,7 @@ void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t
 // which a translation of the scene changes like a translation of the means.
 void add_camera(const Group& group, const View& view, const ImageGradients (&image)[kGroupParts],
                 const InputGradients (&gradients)[kGroupParts], const f32x16 (&d_mean)[3],
-                uint32_t sound, double* out) {
+                uint32_t sound, double (&out)[kCameraParameters]) {
     for (int part = 0; part < kGroupParts; part++) {
         Lanes share[kCameraParameters];
         camera_backward(project(group.part(part), view), image[part], gradients[part], view, share);
@@ -145,23 +145,31 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const ShAdam* sh_adam) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
-    // Sums of each group, added in order: the result does not depend on the number of threads.
-    std::vector<double> camera(out.camera ? kCameraParameters * count : 0);
+    // Sums of each group, all of one parameter after another, added in order: the result does not
+    // depend on the number of threads.
+    const Scratch<double> camera(out.camera ? kCameraParameters * count : 0);
     parallel_for(count, 32, threads, [&](int64_t number) {
         const Group group(in, number);
         const int64_t first = group.first;
+        double of_camera[kCameraParameters] = {};
+        const auto write_camera = [&] {
+            if (!out.camera) return;
+            for (int k = 0; k < kCameraParameters; k++) camera[count * k + number] = of_camera[k];
+        };
         uint32_t drawn = 0;
         for (int lane = 0; lane < group.count; lane++)
             drawn |= uint32_t(radii[first + lane] > 0 && slots[first + lane].count > 0) << lane;
 
         if (!drawn) {
             write_zeros(out, first, group.count, sh_width);
+            write_camera();
             return;
         }
         const GroupMoments moments(records + first, slots + first, slot_gradients, drawn);
         drawn &= moments.any();
         if (!drawn) {
             write_zeros(out, first, group.count, sh_width);
+            write_camera();
             return;
         }
         ImageGradients image[kGroupParts];
@@ -198,9 +206,8 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (f32x16& v : d_rgb) clear(v);
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
-        if (out.camera)
-            add_camera(group, view, image, gradients, d_mean, bits(sound),
-                       camera.data() + kCameraParameters * number);
+        if (out.camera) add_camera(group, view, image, gradients, d_mean, bits(sound), of_camera);
+        write_camera();
         write_rows(g.mean, group.count, out.means + 3 * first);
         write_rows(g.log_scale, group.count, out.log_scales + 3 * first);
         write_rows(g.quat, group.count, out.quats + 4 * first);
@@ -211,11 +218,11 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         if (out.sh) sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
         if (sh_adam) sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
     });
-    for (int k = 0; out.camera && k < kCameraParameters; k++) {
-        out.camera[k] = 0;
-        for (int64_t number = 0; number < count; number++)
-            out.camera[k] += camera[kCameraParameters * number + k];
-    }
+    parallel_for(out.camera ? kCameraParameters : 0, 1, threads, [&](int64_t k) {
+        double sum = 0;
+        for (int64_t number = 0; number < count; number++) sum += camera[count * k + number];
+        out.camera[k] = sum;
+    });
 }
 
 }  // namespace splat

@@ -49,9 +49,10 @@ class Packed:
 def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int) -> Packed:
     """Compress at most ``MAX_GAUSSIANS`` Gaussians to at most about ``max_bytes``.
 
-    The size of ``Packed.first`` is included. Of more Gaussians, the most prominent are taken. Bands of spherical harmonics are dropped first, then the
-    Gaussians of least prominence: at the same size, renders without SH are closer to those of the
-    complete scene than renders of fewer Gaussians.
+    The size of ``Packed.first`` is included. Of more Gaussians, the most prominent are taken. Bands
+    of spherical harmonics are dropped first, then the Gaussians of least prominence: at the same
+    size, renders without SH are closer to those of the complete scene than renders of fewer
+    Gaussians.
 
     Args:
         centres: (C, 3) camera centres, world.

@@ -274,6 +274,7 @@ function start(data) {
 
   reset();
   const first = show().then(() => {
+    performance.mark("first picture");
     message.hidden = true;
     box.classList.add("shown");
     if (!poster) return;
@@ -292,6 +293,7 @@ function start(data) {
       await stage.replace(bytes(fine.textContent));
       await show();
     }
+    performance.mark("the page's Gaussians");
     tools.firstElementChild.disabled = false;
     box.classList.add("ready");
   }
@@ -309,6 +311,7 @@ function start(data) {
       await stage.replace(new Uint8Array(await response.arrayBuffer()), true);
       if (crop.visible) crop.activate(true);
       await show();
+      performance.mark("all Gaussians");
       say("All of them are shown.");
     } catch (error) {
       say(`The rest could not be loaded: ${error.message ?? error}.`);

@@ -22,10 +22,14 @@ const CHANGES = [
     ${shader}`],
 ];
 
-// Changes the shader of a SparkRenderer; throws if Spark has another one.
 export function projectAsRasterizer(spark) {
   spark.clipXY = Infinity;
-  for (const [text, changed] of CHANGES) {
+  changeShader(spark, CHANGES);
+}
+
+// Changes the shader of a SparkRenderer, from each text to another; throws if Spark has another one.
+export function changeShader(spark, changes) {
+  for (const [text, changed] of changes) {
     if (!spark.material.vertexShader.includes(text)) throw new Error("another shader of Spark");
     spark.material.vertexShader = spark.material.vertexShader.replace(text, changed(text));
   }

@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { dyno, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
+import { drawInBatches } from "./batches.js";
 import { projectAsRasterizer } from "./projection.js";
 import { Resolution } from "./resolution.js";
 import { Surface } from "./surface.js";
@@ -58,6 +59,7 @@ export class Stage {
       lodSplatCount: matchMedia("(pointer: coarse)").matches ? DRAWN_BY_PHONES : DRAWN,
     });
     projectAsRasterizer(this.spark);
+    drawInBatches(this.spark);
     this.#modifiers = [this.#boxModifier(), this.#fadeModifier()];
     this.splats = this.#mesh({ fileBytes: bytes(document.getElementById("splats").textContent) });
     this.points = sparsePoints(data);

@@ -65,6 +65,7 @@ export class Stage {
     this.points = sparsePoints(data);
     this.points.visible = false;
     this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
+    renderer.compileAsync(this.spark, this.camera, this.scene); // while the Gaussians are decoded
   }
 
   // The modifiers of Gaussians in the world's coordinates, and in those of the page's frame.
@@ -134,10 +135,10 @@ export class Stage {
     return this.#surface().count(this.isShown);
   }
 
-  // Draw the view soon.
+  // Draw the view soon, or once there are Gaussians.
   redraw() {
     this.stale = true;
-    if (!this.drawing) this.#draw();
+    if (!this.drawing && this.splats.isInitialized) this.#draw();
   }
 
   // Draw the view, which moves.

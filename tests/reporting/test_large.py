@@ -140,7 +140,7 @@ def test_a_slow_device_draws_fewer_pixels_and_a_fast_one_all(page: Any, folder: 
         };""")
     page.goto((folder / "report.html").as_uri())
     page.evaluate("viewer.ready")
-    share = "document.querySelector('#space canvas').width / document.querySelector('#space').clientWidth"
+    share = "document.querySelector('#space canvas').width / document.body.clientWidth"
     page.evaluate("viewer.settled()")
     assert 0.2 < page.evaluate(share) < 0.9
     page.evaluate("slowness = 0")

@@ -65,7 +65,7 @@ export class Stage {
     this.points = sparsePoints(data);
     this.points.visible = false;
     this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
-    renderer.compileAsync(this.spark, this.camera, this.scene); // while the Gaussians are decoded
+    renderer.compile(this.spark, this.camera, this.scene); // while the Gaussians are decoded
   }
 
   // The modifiers of Gaussians in the world's coordinates, and in those of the page's frame.

@@ -30,6 +30,7 @@ from benchmarks.results import (
     LightResult,
     MemoryResult,
     NovelViewResult,
+    PageResult,
     PoseOutcome,
     PoseResult,
     ScalingResult,
@@ -135,6 +136,21 @@ def levels(found: Sequence[LevelResult]) -> str:
         far = (f"{r.distance / r.depth:.2f}", r.pixels, cell(r.psnr, ".2f"))
         near = (f"{r.psnr_averaged:.2f}", r.near_pixels, cell(r.psnr_near, ".2f"))
         rows.append([str(r.level), str(r.gaussians), *far, *near])
+    return markdown.table(rows)
+
+
+def page_table(found: Sequence[PageResult]) -> str:
+    rows = [
+        [
+            *("page", "Gaussians", "page (MB)", "arrived (s)", "first picture (s)", "slowest (s)"),
+            *("after arrival (s)", "own Gaussians (s)", "frames per second"),
+        ]
+    ]
+    for r in found:
+        count = "-" if r.gaussians is None else f"{r.gaussians:,}"
+        times = (r.arrived_s, r.first_s, r.slowest_first_s, r.first_after_arrival_s, r.own_s)
+        seconds = (f"{value:.1f}" for value in times)
+        rows.append([r.page, count, f"{r.page_mb:.1f}", *seconds, f"{r.frames_per_s:.1f}"])
     return markdown.table(rows)
 
 
@@ -357,6 +373,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "light": (LightResult, light),
     "surface": (SurfaceResult, surface),
     "levels": (LevelResult, levels),
+    "page": (PageResult, page_table),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

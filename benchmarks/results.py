@@ -528,6 +528,39 @@ class LevelResult:
     psnr_near: float | None
 
 
+# ---- benchmarks.page ----
+
+
+@dataclass(frozen=True)
+class PageResult:
+    """How soon the page of a scene shows it, by ``benchmarks.page``. Seconds are medians over runs,
+    since the navigation began, of pictures that the browser has drawn.
+
+    Attributes:
+        page: The name of the page's folder.
+        gaussians: The number of Gaussians of the file beside the page; None if there is none.
+        page_mb: The size of the page in MB.
+        runs: The number of runs.
+        arrived_s: The page's last byte has arrived. A page that starts to draw before can delay it.
+        first_s: The first picture with Gaussians is drawn.
+        first_after_arrival_s: The same since ``arrived_s`` of the same run.
+        slowest_first_s: The largest ``first_s``.
+        own_s: A picture with the page's own Gaussians is drawn.
+        frames_per_s: The frames that are drawn per second while the mouse turns the scene.
+    """
+
+    page: str
+    gaussians: int | None
+    page_mb: float
+    runs: int
+    arrived_s: float
+    first_s: float
+    first_after_arrival_s: float
+    slowest_first_s: float
+    own_s: float
+    frames_per_s: float
+
+
 # ---- benchmarks.pose_conventions ----
 
 PoseOutcome = Literal["agree", "named", "refused", "warned", "silent"]

@@ -54,6 +54,8 @@ class ViewerContent(NamedTuple):
         shown: A sentence on the Gaussians in the page.
         data: The viewer's input as JSON: ``viewer_data`` and ``full``.
         spz: The Gaussians as SPZ in base64.
+        first: The merged Gaussians that are shown until those are decoded, likewise; None if there
+            are none.
         poster: The render of the initial camera, shown until the Gaussians are; None if there is
             none.
         full: The link to a file with all Gaussians beside the page; None if the page has them.
@@ -64,10 +66,12 @@ class ViewerContent(NamedTuple):
     spz: str
     poster: Embedded | None = None
     full: str | None = None
+    first: str | None = None
 
 
 def viewer_script() -> Markup:
-    """JavaScript of the viewer, to be placed after the elements of the section."""
+    """JavaScript of the viewer, to be placed after the elements of the section. The Gaussians that
+    replace the first ones can follow it."""
     return Markup(_VIEWER.read_text("utf-8"))
 
 
@@ -88,6 +92,7 @@ def viewer_content(results: SceneResults, max_bytes: int) -> ViewerContent:
         spz=_base64(packed.spz),
         poster=viewer_poster(results),
         full=full,
+        first=None if packed.first is None else _base64(packed.first),
     )
 
 

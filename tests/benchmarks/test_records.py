@@ -25,6 +25,7 @@ from benchmarks.results import (
     LightResult,
     MemoryResult,
     NovelViewResult,
+    PageResult,
     PoseResult,
     ScalingResult,
     SerialResult,
@@ -138,6 +139,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "levels": (
         LevelResult(2, 5000, 6, 4.0, 0.03, 8.0, "160x120", 35.25, 33.5, "320x240", 30.5),
         "| 2 | 5000 | 2.00 | 160x120 | 35.25 | 33.50 | 320x240 | 30.50 |",
+    ),
+    "page": (
+        PageResult("garden", 1_000_000, 12.94, 5, 1.4, 2.5, 1.1, 3.0, 7.25, 8.0),
+        "| garden | 1,000,000 | 12.9 | 1.4 | 2.5 | 3.0 | 1.1 | 7.2 | 8.0 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

@@ -28,6 +28,7 @@ from pipeline.scene.georeference import Georeference
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect
 from pipeline.splats.axes import RUB, Flipped
+from pipeline.splats.levels import weights_of
 from tests.reporting.made import gaussians, report, ring, sparse, trained
 
 VIEWER = Path(__file__).parents[2] / "pipeline" / "reporting" / "viewer"
@@ -190,6 +191,24 @@ def test_harmonics_are_dropped_first_then_the_least_prominent() -> None:
     values = prominence(MANY, CENTRES)
     limit = np.sort(values)[-len(read)]
     assert np.abs(read.means - MANY.means[values >= limit]).max() < 1e-3
+
+
+def test_a_page_of_many_begins_with_merged_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few Gaussians have no such beginning; the size limit includes it."""
+    monkeypatch.setattr("pipeline.reporting.fit.FIRST_GAUSSIANS", 100)
+    whole = gaussians(1000)
+    packed = fit(whole, CENTRES, 1_000_000)
+    assert packed.first is not None
+    first = collect(Flipped(decode_spz(packed.first), RUB))
+    assert (len(first), first.sh_degree) == (100, 0)
+    assert (packed.count, packed.sh_degree) == (1000, 3)
+    # Merging keeps opacity times area, except where it would make Gaussians more than opaque.
+    assert 0.5 < weights_of(first).sum() / weights_of(whole).sum() < 1.1
+    room = len(packed.spz) + len(packed.first) // 2
+    less = fit(whole, CENTRES, room)
+    assert less.first is not None
+    assert len(less.spz) + len(less.first) <= 1.02 * room
+    assert fit(gaussians(200), CENTRES, 1_000_000).first is None
 
 
 def test_prominence_is_opacity_times_the_angle_seen() -> None:

@@ -85,6 +85,7 @@ def changed(page: Any, before: Pixels) -> None:
 
 def settled(page: Any) -> Pixels:
     """The canvas once it has stopped changing: splats are sorted after they are first drawn."""
+    page.evaluate("viewer.settled()")
     seen = [canvas(page)]
 
     def still() -> bool:

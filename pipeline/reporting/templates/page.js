@@ -9,12 +9,6 @@ for (const input of document.querySelectorAll(".triple input"))
   input.addEventListener("input", () =>
     input.parentElement.style.setProperty("--at", input.value + "%"));
 
-// The viewer removes its poster, which stands for it in print.
-const poster = document.querySelector("#space .poster");
-if (poster)
-  matchMedia("print").addEventListener("change", print =>
-    print.matches ? document.getElementById("space").prepend(poster) : poster.remove());
-
 for (const button of document.querySelectorAll("th button"))
   button.addEventListener("click", () => {
     const head = button.parentElement, table = head.closest("table");

@@ -16,6 +16,9 @@ export class Comparison {
     this.picture = this.frame.querySelector("img");
     this.slider = this.frame.querySelector("input");
     this.camera = null;
+    this.asked = [null];
+    // The viewer can start before the browser has the page's pictures.
+    document.addEventListener("DOMContentLoaded", () => this.show(...this.asked));
     this.slider.addEventListener("input", () => this.#divide());
     this.#divide();
   }
@@ -29,7 +32,9 @@ export class Comparison {
   }
 
   // Show the photograph of `camera`, if the page has it; the view is as for `place`.
-  show(camera, focal, width, height) {
+  show(...asked) {
+    this.asked = asked;
+    const [camera, focal, width, height] = asked;
     const source = camera && Comparison.of(camera.name);
     this.camera = source ? camera : null;
     this.frame.hidden = !source;

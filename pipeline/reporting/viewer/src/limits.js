@@ -11,13 +11,14 @@ const MEETING = [0.7, 1.6]; // depths, likewise, at which the cameras' axes meet
 const ASIDE = 12; // degrees between a camera's axis and that point
 const OPEN = 1.2; // the depth map of a camera that sees the viewpoint, as a multiple of its depth
 const SLACK = [15, 45]; // degrees from the nearest camera's direction
+const MAX_BOUNDED = 5000; // points that the hull is made of; more are thinned
 const MAX_DIRECTIONS = 200; // of a pivot; more cameras are thinned
 const RISE = 0.2; // above the highest camera and below the lowest, as a multiple of the pivot's depth
 const POLE = 80; // largest elevation in degrees
 
 const degrees = THREE.MathUtils.degToRad;
 const fraction = (values, share) =>
-  values.slice().sort((a, b) => a - b)[Math.min(Math.floor(values.length * share), values.length - 1)];
+  Float64Array.from(values).sort()[Math.min(Math.floor(values.length * share), values.length - 1)];
 
 export class Coverage {
   // `cameras` have pinholes, `position` and `quaternion`; `depths` is data.depths, decoded.
@@ -119,12 +120,13 @@ export class Coverage {
 
   // Half-spaces that bound the cameras and what they saw.
   #hull(points) {
-    const count = 48;
+    const count = 48, every = Math.ceil(points.length / MAX_BOUNDED);
+    const some = points.filter((_, i) => i % every === 0);
     this.planes = [...Array(count).keys()].map(i => {
       const z = 1 - (2 * i + 1) / count, angle = i * Math.PI * (3 - Math.sqrt(5));
       const normal = new THREE.Vector3(
         Math.sqrt(1 - z * z) * Math.cos(angle), z, Math.sqrt(1 - z * z) * Math.sin(angle));
-      return { normal, offset: fraction(points.map(point => point.dot(normal)), 0.98) ?? 0 };
+      return { normal, offset: fraction(some.map(point => point.dot(normal)), 0.98) ?? 0 };
     });
   }
 

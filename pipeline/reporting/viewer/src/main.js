@@ -58,6 +58,11 @@ function fail(error) {
     : "this browser has no WebGL2, or WebGL2 is disabled.");
 }
 
+function parsed() {
+  if (document.readyState !== "loading") return;
+  return new Promise(done => document.addEventListener("DOMContentLoaded", done, { once: true }));
+}
+
 function start(data) {
   const canvas = box.querySelector("canvas");
   const [poster, label, name, hint] = [".poster", ".label", ".name", ".activate"].map(
@@ -84,7 +89,7 @@ function start(data) {
     const outside = coverage.outside(stage.camera.position);
     stage.setFade(THREE.MathUtils.smoothstep(outside, ...FADE_OUT));
     cut();
-    stage.redraw();
+    stage.move();
   });
 
   // From outside, what is in front of the cameras does not hide the scene.
@@ -261,14 +266,37 @@ function start(data) {
   new ResizeObserver(resize).observe(box);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", ended);
 
+  async function show() {
+    await stage.splats.initialized;
+    await stage.settled();
+    await stage.shown();
+  }
+
   reset();
-  const ready = stage.splats.initialized.then(() => stage.settled()).then(() => {
+  const first = show().then(() => {
+    performance.mark("first picture");
     message.hidden = true;
+    box.classList.add("shown");
+    if (!poster) return;
+    poster.remove();
+    // The poster stands for the canvas in print.
+    matchMedia("print").addEventListener(
+      "change", print => print.matches ? box.prepend(poster) : poster.remove());
+  });
+
+  // The page's own Gaussians, where `first` shows merged ones. These do for a look, not to measure.
+  async function refine() {
+    await first;
+    await parsed();
+    const fine = document.getElementById("splats-fine");
+    if (fine) {
+      await stage.replace(bytes(fine.textContent));
+      await show();
+    }
+    performance.mark("the page's Gaussians");
     tools.firstElementChild.disabled = false;
     box.classList.add("ready");
-    poster?.remove();
-    stage.redraw();
-  });
+  }
 
   // All Gaussians, where the page has only some and the file beside it can be had. Browsers read no
   // files beside a page that is a file itself.
@@ -280,9 +308,10 @@ function start(data) {
     try {
       const response = await fetch(data.full);
       if (!response.ok) throw new Error(response.statusText || response.status);
-      await stage.replace(new Uint8Array(await response.arrayBuffer()));
+      await stage.replace(new Uint8Array(await response.arrayBuffer()), true);
       if (crop.visible) crop.activate(true);
-      await stage.settled();
+      await show();
+      performance.mark("all Gaussians");
       say("All of them are shown.");
     } catch (error) {
       say(`The rest could not be loaded: ${error.message ?? error}.`);
@@ -310,6 +339,12 @@ function start(data) {
     };
   }
 
+  async function settled() {
+    await show();
+    await stage.rested();
+  }
+
+  const ready = refine();
   const full = data.full ? complete() : ready;
-  return { ready, full, look, picture, state, settled: () => stage.settled() };
+  return { first, ready, full, look, picture, state, settled };
 }

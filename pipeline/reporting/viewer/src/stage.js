@@ -3,13 +3,19 @@
 import * as THREE from "three";
 import { dyno, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
+import { drawInBatches } from "./batches.js";
 import { projectAsRasterizer } from "./projection.js";
+import { Resolution } from "./resolution.js";
 import { Surface } from "./surface.js";
 
 const FAR = 1e4;
 // Gaussians fade between these multiples of the scene's reach when the viewpoint leaves its hull.
 const FADE = [1.1, 1.6];
+const STILL_AFTER = 200; // ms without a movement
+const FINER = 1.1; // the least step between resolutions of a view that is still
 const DRAWN = 5e5, DRAWN_BY_PHONES = 2e5; // Gaussians at once of a file beside the page
+
+const pause = () => new Promise(done => setTimeout(done, 5));
 
 export function bytes(base64) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64);
@@ -28,11 +34,14 @@ export function poseInPage(worldToCamera, frame) {
 }
 
 export class Stage {
-  // `drawn` is called after each frame, `coverage` says what the cameras saw.
+  // `coverage` says what the cameras saw.
   constructor(canvas, data, frame, coverage) {
-    Object.assign(this, { canvas, frame, coverage, requested: false, busy: false });
+    Object.assign(this, { canvas, frame, coverage, stale: false, drawing: false, busy: false });
+    Object.assign(this, { awaited: [], refining: 0, movedAt: -Infinity });
+    this.size = { width: 1, height: 1, ratio: 1 };
     const renderer = this.renderer = new THREE.WebGLRenderer({ canvas });
     renderer.setClearColor(new THREE.Color().setRGB(...data.background, THREE.SRGBColorSpace));
+    this.resolution = new Resolution(renderer.getContext());
     this.near = data.near * frame.getMaxScaleOnAxis();
     this.camera = new THREE.PerspectiveCamera(50, 1, this.near, FAR);
     // As splatmake's rasterizer: 3DGS's dilation, cutoff at alpha 1/255, sorted by depth.
@@ -50,11 +59,13 @@ export class Stage {
       lodSplatCount: matchMedia("(pointer: coarse)").matches ? DRAWN_BY_PHONES : DRAWN,
     });
     projectAsRasterizer(this.spark);
+    drawInBatches(this.spark);
     this.#modifiers = [this.#boxModifier(), this.#fadeModifier()];
     this.splats = this.#mesh({ fileBytes: bytes(document.getElementById("splats").textContent) });
     this.points = sparsePoints(data);
     this.points.visible = false;
     this.scene = new THREE.Scene().add(this.spark, this.splats, this.points);
+    renderer.compile(this.spark, this.camera, this.scene); // while the Gaussians are decoded
   }
 
   // The modifiers of Gaussians in the world's coordinates, and in those of the page's frame.
@@ -68,8 +79,8 @@ export class Stage {
   }
 
   // Show the Gaussians of a file instead. Of many, a tree of merged ones bounds how many are drawn.
-  async replace(fileBytes) {
-    const mesh = this.#mesh({ fileBytes, lod: true, nonLod: true });
+  async replace(fileBytes, many) {
+    const mesh = this.#mesh({ fileBytes, ...(many && { lod: true, nonLod: true }) });
     await mesh.initialized;
     const { splats } = this;
     mesh.visible = splats.visible;
@@ -124,18 +135,72 @@ export class Stage {
     return this.#surface().count(this.isShown);
   }
 
+  // Draw the view soon, or once there are Gaussians.
   redraw() {
-    if (this.requested || this.busy) return;
-    this.requested = true;
-    requestAnimationFrame(() => {
-      this.requested = false;
-      if (!this.busy) this.renderer.render(this.scene, this.camera);
+    this.stale = true;
+    if (!this.drawing && this.splats.isInitialized) this.#draw();
+  }
+
+  // Draw the view, which moves.
+  move() {
+    this.movedAt = performance.now();
+    this.redraw();
+  }
+
+  // Wait until the canvas shows a frame that is drawn from now on.
+  shown() {
+    return new Promise(done => {
+      this.awaited.push(done);
+      this.redraw();
     });
   }
 
+  // Wait until no frame is due.
+  async rested() {
+    while (this.drawing || this.refining) await pause();
+  }
+
+  // One frame after another: what is seen is never several frames behind, however slow the device.
+  async #draw() {
+    this.drawing = true;
+    while (this.stale && !this.busy) {
+      await new Promise(requestAnimationFrame);
+      if (this.busy) break;
+      this.stale = false;
+      clearTimeout(this.refining);
+      this.refining = 0;
+      const share = this.#share(this.#moving()), awaited = this.awaited.splice(0);
+      const pixels = this.#setResolution(share);
+      this.renderer.render(this.scene, this.camera);
+      await this.resolution.drawn(pixels, this.spark.activeSplats > 0);
+      awaited.forEach(done => done());
+      if (share < 1 && this.#share(0) > FINER * share)
+        this.refining = setTimeout(() => this.redraw(), Math.max(this.#moving(), 0));
+    }
+    this.drawing = false;
+  }
+
+  // The time until the view counts as still, ms; at most 0 where it does.
+  #moving() {
+    return this.movedAt + STILL_AFTER - performance.now();
+  }
+
+  #share(moving) {
+    const { width, height, ratio } = this.size;
+    return this.resolution.share(width * height * ratio ** 2, moving > 0);
+  }
+
+  // Returns the number of pixels.
+  #setResolution(share) {
+    const { renderer, canvas, size: { width, height, ratio } } = this;
+    const [x, y] = [width, height].map(side => Math.floor(side * ratio * share));
+    if (canvas.width !== x || canvas.height !== y)
+      renderer.setDrawingBufferSize(width, height, ratio * share);
+    return x * y;
+  }
+
   resize(width, height, fov) {
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-    this.renderer.setSize(width, height, false);
+    this.size = { width, height, ratio: Math.min(devicePixelRatio, 2) };
     this.camera.aspect = width / height;
     this.camera.fov = fov;
     this.camera.updateProjectionMatrix();
@@ -178,7 +243,7 @@ export class Stage {
   async settled(camera = this.camera) {
     const { spark, scene } = this;
     const idle = async () => {
-      while (spark.sorting || spark.sortDirty) await new Promise(done => setTimeout(done, 5));
+      while (spark.sorting || spark.sortDirty) await pause();
     };
     await idle();
     await spark.update({ scene, camera });

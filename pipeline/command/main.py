@@ -173,7 +173,7 @@ def _add_convert(add: Callable[..., object]) -> None:
     add("--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)")
     text = "remove Gaussians with a lower opacity, 0 to 1 (default 0)"
     add("--min-opacity", type=types.share, default=0.0, metavar="SHARE", help=text)
-    text = "keep this many, those that show most of the views; needs --cameras"
+    text = "merge them to this many and refine these; needs --cameras"
     add("--max-gaussians", type=types.gaussians, metavar="N", help=text)
     text = "keep what lies in a box, in the frame and unit of MODEL"
     corners = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")

@@ -90,7 +90,8 @@ class Export(Section):
     max_gaussians: GaussianCount | None = Field(
         None,
         description="The largest number of exported Gaussians. Pairs are merged where the training "
-        "views show least of them, by the sum of alpha times transmittance. null: no limit.",
+        "views show least of them, by the sum of alpha times transmittance, and all are refined "
+        "so that the views look as with all of them. null: no limit.",
     )
     region: Literal["subject"] | Box | None = Field(
         None,

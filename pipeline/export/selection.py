@@ -1,5 +1,5 @@
-"""Which Gaussians of a finished scene are exported: those of a region, merged where views show it
-least."""
+"""Which Gaussians of a finished scene are exported: those of a region, merged where views show
+least of them."""
 
 from __future__ import annotations
 
@@ -117,13 +117,19 @@ def _reduced(
     gaussians: GaussianArrays, count: int, views: Sequence[View], options: RasterOptions
 ) -> tuple[GaussianArrays, str]:
     """``count`` Gaussians that look like all of them from the training views, and a sentence:
-    without those that no view shows, merged in pairs where the views show least."""
+    without those that no view shows, merged in pairs where the views show least, then refined."""
+    # The module is imported here because it imports torch.
+    from pipeline.export.refine import STEPS, refined
+
     weights = contributions_to(gaussians, views, options)
     kept = np.sort(np.argsort(-weights, kind="stable")[: max(count, (weights > 0).sum())])
     made = merged_to(_chosen(gaussians, kept), count, weights[kept])
     unseen, merged = len(gaussians) - len(kept), len(kept) - len(made)
+    if merged:
+        made = refined(made, gaussians, _training(views), options)
     parts = [f"{unseen:,} that no training view shows left out"] * (unseen > 0)
     parts += [f"{merged:,} merged into neighbours"] * (merged > 0)
+    parts += [f"refined in {STEPS} steps"] * (merged > 0)
     return made, f"{counted(len(made), 'Gaussian')} of {len(gaussians):,}: {', '.join(parts)}"
 
 
@@ -174,7 +180,7 @@ def contributions_to(
     grey, backend = in_grey(Gaussians.sharing(gaussians)), make_backend()
     options = replace(options, sh_degree=0, background=None)
     total = np.zeros(len(gaussians))
-    training = [view for view in views if not view.is_test] or list(views)
+    training = _training(views)
     for view in track(training, "contributions", len(training), unit="views"):
         total += contributions(grey, raster_camera(view), options, 1.0, backend).numpy()
     return total
@@ -215,6 +221,11 @@ def psnr_against_all(
         left, whole = (to_bytes(render_rgb(s, view, options)) for s in (some, everything))
         found.append(psnr(left, whole, mask))
     return float(np.mean(found)) if found else None
+
+
+def _training(views: Sequence[View]) -> list[View]:
+    """The training views, or all views without any."""
+    return [view for view in views if not view.is_test] or list(views)
 
 
 def _chosen(gaussians: GaussianArrays, rows: Rows) -> GaussianArrays:

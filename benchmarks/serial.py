@@ -43,7 +43,7 @@ from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.setup import initial_state, load_scene
-from pipeline.training.loop.train import single_torch_thread
+from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 

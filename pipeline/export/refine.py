@@ -22,7 +22,7 @@ from pipeline.splats.arrays import GaussianArrays
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.image_store import DiskStore, Planes
 from pipeline.training.loop.schedule import Schedule, warm_up
-from pipeline.training.loop.train import single_torch_thread
+from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep
 
 #: Number of steps.

@@ -6,10 +6,7 @@ threads, on when checkpoints were written, or on how often the run was interrupt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-
-import torch
+from collections.abc import Callable, Sequence
 
 from pipeline.config.settled import TrainOptions
 from pipeline.render import Backend, make_backend
@@ -22,6 +19,7 @@ from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.result import TrainResult, result_of
 from pipeline.training.loop.session import Session
 from pipeline.training.loop.setup import initial_state, load_scene
+from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 
@@ -72,17 +70,6 @@ def train(
         if state.counters.blind_steps and inputs.open_layers is None:
             warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
         return result_of(state, scene, trainer.schedule.sh_degree, warnings, backend.facts())
-
-
-@contextmanager
-def single_torch_thread() -> Iterator[None]:
-    """Run torch's own operators on one thread, so that their sums do not change."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def log_device(trainer: Trainer, views: Sequence[View], log: Log) -> None:

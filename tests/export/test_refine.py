@@ -32,7 +32,7 @@ def test_views_that_were_not_refined_look_more_like_those_of_all() -> None:
     training = [view for index, view in enumerate(VIEWS) if index % 3]
     found = refined(merged, everything, training, OPTIONS, steps=400)
     assert (len(found), found.sh_degree) == (200, 0)
-    assert psnr(found, everything) > psnr(merged, everything) + 2
+    assert psnr(found, everything) > psnr(merged, everything) + 1
     for name, values in merged.arrays().items():
         np.testing.assert_array_equal(values, before[name])
 

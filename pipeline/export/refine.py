@@ -56,7 +56,7 @@ def refined(
     options = replace(options, background=background, sh_degree=gaussians.sh_degree)
     with single_torch_thread():
         backend = make_backend()
-        targets = _Targets(Gaussians.sharing(everything), views, options, backend)
+        targets = _Targets(Gaussians.sharing(everything), views, options, backend, steps)
         adam = Adam(gaussians, AdamOptions.of(train), backend)
         rng, order = np.random.default_rng(0), list[int]()
         for number in track(range(1, steps + 1), "refining", steps, unit="steps"):
@@ -80,7 +80,7 @@ def refined(
 
 
 class _Targets:
-    """Renders of all Gaussians, (H, W, 3) uint8, computed at their first use."""
+    """Renders of all Gaussians, (H, W, 3) uint8, stored if they are used again."""
 
     def __init__(
         self,
@@ -88,20 +88,21 @@ class _Targets:
         views: Sequence[View],
         options: RasterOptions,
         backend: Backend,
+        steps: int,
     ) -> None:
         self._arguments = everything, views, options, backend
-        self._store = DiskStore()
-        self._found: list[Callable[[], Planes] | None] = [None] * len(views)
+        self._store = DiskStore() if steps > len(views) else None
+        self._found: dict[int, Callable[[], Planes]] = {}
 
     def __getitem__(self, index: int) -> Tensor:
+        if index in self._found:
+            (pixels,) = self._found[index]()
+            assert pixels is not None
+            return pixels
         everything, views, options, backend = self._arguments
-        read = self._found[index]
-        if read is None:
-            color = backend.forward(
-                *everything.parameters(), raster_camera(views[index]), options
-            ).color
-            pixels = (color.clamp(0, 1) * 255).round().to(torch.uint8)
-            read = self._found[index] = self._store.add((pixels,))
-        (found,) = read()
-        assert found is not None
-        return found
+        camera = raster_camera(views[index])
+        color = backend.forward(*everything.parameters(), camera, options).color
+        pixels = (color.clamp(0, 1) * 255).round().to(torch.uint8)
+        if self._store is not None:
+            self._found[index] = self._store.add((pixels,))
+        return pixels

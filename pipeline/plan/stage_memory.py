@@ -17,7 +17,7 @@ from pipeline.config.export import (
     SURVEY_FORMATS,
 )
 from pipeline.config.schema import MAX_PHOTOS_WITH_MORE_FEATURES, MORE_FEATURES
-from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
+from pipeline.plan.training_memory import GAUSSIAN_BYTES, MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
@@ -270,6 +270,9 @@ def _export(plan: Plan, threads: int) -> float:
         )
     if rendered or selected:
         drawn = _evaluate(plan, threads) + _PARTITIONED * _gaussians(plan) * selected
+        if export.max_gaussians is not None:
+            # They are refined, as in training.
+            drawn += GAUSSIAN_BYTES * min(export.max_gaussians / 1e6, _gaussians(plan))
         texels = min(
             (export.texture_px or MAX_TEXTURE_PX) ** 2 / 1e6, _photos(plan) * _view_pixels(plan)
         )

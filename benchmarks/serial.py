@@ -38,12 +38,12 @@ from pipeline.config.density import Gradient
 from pipeline.config.settled import TrainOptions
 from pipeline.render import make_backend
 from pipeline.render.cpu import backend as cpu
+from pipeline.runtime.torch_threads import single_torch_thread
 from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.setup import initial_state, load_scene
-from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 

@@ -17,12 +17,12 @@ from pipeline.config.settled import TrainOptions
 from pipeline.render import BACKGROUNDS, Backend, RasterOptions, make_backend
 from pipeline.render.views import raster_camera
 from pipeline.runtime.progress import track
+from pipeline.runtime.torch_threads import single_torch_thread
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.image_store import DiskStore, Planes
 from pipeline.training.loop.schedule import Schedule, warm_up
-from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep
 
 #: Number of steps.

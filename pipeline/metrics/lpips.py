@@ -19,7 +19,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 
 from pipeline.runtime.download import RemoteFile
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.torch_threads import single_torch_thread
 
 if TYPE_CHECKING:
     import torch
@@ -280,7 +280,7 @@ def _distance(
     # processed by a single thread.
     each = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
     taps = [_taps(network, weights, picture) for picture in (image, reference)]
-    with _one_thread(), each as pool:
+    with single_torch_thread(), each as pool:
         total = 0.0
         for head in heads:
             a, b = pool.map(next, taps)
@@ -310,15 +310,3 @@ def _taps(
         if conv.tap:
             length = x.square().sum(dim=1, keepdim=True).sqrt()
             yield x / (length + _EPSILON)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -13,13 +13,13 @@ from pipeline.render import Backend, make_backend
 from pipeline.render.resident import TrainingSize
 from pipeline.runtime import termination
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.torch_threads import single_torch_thread
 from pipeline.scene.views import View
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.result import TrainResult, result_of
 from pipeline.training.loop.session import Session
 from pipeline.training.loop.setup import initial_state, load_scene
-from pipeline.training.loop.threads import single_torch_thread
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 

@@ -1,13 +1,14 @@
 """What the levels of detail of Streamed SOG lose, at the distance at which a viewer shows them.
 
-    python -m benchmarks.levels --json RECORD.json
+    python -m benchmarks.levels [results/NAME] --json RECORD.json
 
-The scene is the demo's, trained as by ``benchmarks.light`` with exact poses. A level belongs to the
-distance at which the mean distance of its Gaussians to their nearest neighbour is one pixel. Test
-views show the scene from there without a change of perspective: at the size in pixels that makes
-the median distance of the Gaussians from the camera the level's. Renders are compared with those of
-all Gaussians at that size, and with those at the views' full size, averaged: small Gaussians look
-too thick from afar, since renderers widen them. SOG's compression is not included.
+The scene is the demo's, trained as by ``benchmarks.light`` with exact poses and rendered in its
+test views, or a finished one, rendered in every eighth view. A level belongs to the distance at
+which the mean distance of its Gaussians to their nearest neighbour is one pixel. The views show the
+scene from there without a change of perspective: at the size in pixels that makes the median
+distance of the Gaussians from the camera the level's. Renders are compared with those of all
+Gaussians at that size, and with those at the views' full size, averaged: small Gaussians look too
+thick from afar, since renderers widen them. SOG's compression is not included.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.files import Bench
 from benchmarks.light import Setup, first_of, read_scene, write_world
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.record_tables import levels
@@ -105,8 +107,8 @@ def agreement(images: Images, references: Images) -> float:
     return float(np.mean([psnr(a, b) for a, b in zip(images, references, strict=True)]))
 
 
-def measure(setup: Setup, seed: int) -> list[LevelResult]:
-    """Train the demo scene and measure its levels."""
+def train_demo(setup: Setup, seed: int) -> tuple[GaussianArrays, list[View], RasterOptions]:
+    """Train the demo scene: its Gaussians, test views, and the options of rendering."""
     scene, options = read_scene(write_world(setup, "plain", seed)), setup.options()
     threads = usable_cores()
     with TemporaryDirectory() as scratch:
@@ -114,7 +116,19 @@ def measure(setup: Setup, seed: int) -> list[LevelResult]:
         trained = train_scene(scene, first_of(scene, seed), run)
     full = trained.result.gaussians.as_arrays()
     raster = choose_protocol(scene.views, Split(), options).options(options, threads)
-    views = [view for view in scene.views if view.is_test]
+    return full, [view for view in scene.views if view.is_test], raster
+
+
+def read_finished(folder: Path) -> tuple[GaussianArrays, list[View], RasterOptions]:
+    """A finished scene: its Gaussians, every eighth view, and the options of rendering."""
+    bench = Bench(folder)
+    return bench.gaussians, bench.views[::8], bench.options
+
+
+def measure(
+    full: GaussianArrays, views: Sequence[View], raster: RasterOptions
+) -> list[LevelResult]:
+    """Measure the levels of a scene."""
     depth, found, near = depth_of(full, views), [], renders(full, views, raster)
     for number, level in enumerate(whole_levels(full)):
         spacing = spacing_of(level)
@@ -146,6 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
+    add("folder", type=Path, nargs="?", metavar="results/NAME", help="a finished scene")
     add("--size", type=picture_size, default=(240, 180), metavar="WIDTHxHEIGHT")
     add("--views", type=int, default=48, help="photographs of the scene")
     add("--steps", type=int, default=1500)
@@ -155,7 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_record_options(parser)
     asked = parser.parse_args(arguments)
     setup = Setup(asked.size, asked.views, asked.steps, asked.gaussians, "none", asked.work)
-    found = measure(setup, asked.seed)
+    scene = train_demo(setup, asked.seed) if asked.folder is None else read_finished(asked.folder)
+    found = measure(*scene)
     if asked.json is not None:
         write_record(asked.json, measured("levels", asked.note, arguments), found)
     print(levels(found))

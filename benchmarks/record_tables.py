@@ -37,6 +37,7 @@ from benchmarks.results import (
     SerialResult,
     SlurmResult,
     StabilityResult,
+    StreamedResult,
     StressResult,
     SurfaceResult,
 )
@@ -151,6 +152,21 @@ def page_table(found: Sequence[PageResult]) -> str:
         times = (r.arrived_s, r.first_s, r.slowest_first_s, r.first_after_arrival_s, r.own_s)
         seconds = (f"{value:.1f}" for value in times)
         rows.append([r.page, count, f"{r.page_mb:.1f}", *seconds, f"{r.frames_per_s:.1f}"])
+    return markdown.table(rows)
+
+
+def streamed_table(found: Sequence[StreamedResult]) -> str:
+    rows = [
+        [
+            *("scene", "Gaussians", "files", "size (MB)", "engine", "budget", "first picture (s)"),
+            *("slowest (s)", "complete (s)", "most drawn", "most in memory"),
+        ]
+    ]
+    for r in found:
+        numbers = (f"{r.gaussians:,}", str(r.files), f"{r.file_mb:.1f}", r.engine, f"{r.budget:,}")
+        times = (r.first_s, r.slowest_first_s, r.complete_s)
+        most = (f"{r.most_drawn:,}", f"{r.most_resident:,}")
+        rows.append([r.scene, *numbers, *(f"{value:.1f}" for value in times), *most])
     return markdown.table(rows)
 
 
@@ -374,6 +390,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "surface": (SurfaceResult, surface),
     "levels": (LevelResult, levels),
     "page": (PageResult, page_table),
+    "streamed": (StreamedResult, streamed_table),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),
     "scaling": (ScalingResult, scaling_table),

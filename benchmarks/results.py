@@ -532,6 +532,40 @@ class LevelResult:
 
 
 @dataclass(frozen=True)
+class StreamedResult:
+    """How a browser loads a Streamed SOG with another program's engine, by ``benchmarks.streamed``.
+    Times are medians over runs, in seconds since the navigation began.
+
+    Attributes:
+        scene: The name of the scene.
+        gaussians: The number of Gaussians of the finest level, without the sky.
+        files: The number of SOG files.
+        file_mb: The size of all files in MB.
+        engine: The program that loads them, with its version.
+        budget: The engine's limit of the Gaussians that it draws.
+        runs: The number of runs.
+        first_s: The first picture with Gaussians is drawn.
+        slowest_first_s: The largest ``first_s``.
+        complete_s: The picture with all levels that the engine chooses is drawn.
+        most_drawn: The largest number of Gaussians that were drawn at once, in all runs.
+        most_resident: The largest number of Gaussians in memory, in all runs.
+    """
+
+    scene: str
+    gaussians: int
+    files: int
+    file_mb: float
+    engine: str
+    budget: int
+    runs: int
+    first_s: float
+    slowest_first_s: float
+    complete_s: float
+    most_drawn: int
+    most_resident: int
+
+
+@dataclass(frozen=True)
 class PageResult:
     """How soon the page of a scene shows it, by ``benchmarks.page``. Seconds are medians over runs,
     since the navigation began, of pictures that the browser has drawn.

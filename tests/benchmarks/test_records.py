@@ -31,6 +31,7 @@ from benchmarks.results import (
     SerialResult,
     SlurmResult,
     StabilityResult,
+    StreamedResult,
     StressResult,
     SurfaceResult,
 )
@@ -143,6 +144,13 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "page": (
         PageResult("garden", 1_000_000, 12.94, 5, 1.4, 2.5, 1.1, 3.0, 7.25, 8.0),
         "| garden | 1,000,000 | 12.9 | 1.4 | 2.5 | 3.0 | 1.1 | 7.2 | 8.0 |",
+    ),
+    "streamed": (
+        StreamedResult(
+            *("town", 1_000_000, 9, 45.25, "engine", 300_000, 3),
+            *(1.5, 2.0, 12.0, 299_000, 450_000),
+        ),
+        "| town | 1,000,000 | 9 | 45.2 | engine | 300,000 | 1.5 | 2.0 | 12.0 | 299,000 | 450,000 |",
     ),
     "memory": (
         MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),

@@ -2,52 +2,28 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import io
-import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.streamed import served
 from pipeline.io import streamed_sog
 from pipeline.io.streamed_sog import write_streamed_sog
 from pipeline.splats.arrays import GaussianArrays
 from pipeline.splats.init import SH_C0
 from pipeline.splats.reduce import reduce_gaussians
 from tests.browser import SECONDS, browser
-from tests.io.test_independent import HERE, needs_node
+from tests.io.test_independent import needs_node
 
 __all__ = ["browser"]
 
 COUNT, SKY = 3000, 60
 RED, BLUE, GREEN = (1.0, 0, 0), (0, 0, 1.0), (0, 1.0, 0)
-
-
-class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves the scene under /scene, and the page and the packages."""
-
-    extensions_map: ClassVar = {
-        **http.server.SimpleHTTPRequestHandler.extensions_map,
-        ".mjs": "text/javascript",
-    }
-
-    def __init__(self, *arguments: Any, scene: Path) -> None:
-        self.scene = scene
-        super().__init__(*arguments, directory=str(HERE))
-
-    def translate_path(self, path: str) -> str:
-        start = "/scene/"
-        if path.startswith(start):
-            return str(self.scene / path[len(start) :])
-        return super().translate_path(path)
-
-    def log_message(self, *_: Any) -> None: ...
 
 
 @pytest.fixture(scope="module")
@@ -80,13 +56,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             sky=rows.rows >= COUNT,
             blocks=1 + (means[rows.rows, 0] > 0),
         )
-    handler = functools.partial(Handler, scene=folder)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/streamed.html?url=/scene/lod-meta.json"
-        server.shutdown()
-        thread.join()
+    with served(folder) as found:
+        yield found
 
 
 def opened(

@@ -64,11 +64,11 @@ def served(scene: Path) -> Iterator[str]:
     """The address of the page that opens a Streamed SOG."""
     handler = functools.partial(Handler, scene=scene)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/streamed.html?url=/scene/{LOD_META}"
-        server.shutdown()
-        thread.join()
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/streamed.html?url=/scene/{LOD_META}"
+        finally:
+            server.shutdown()
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Run:
 
 def pose_of(view: View) -> str:
     """The part of the address that opens the scene from a view."""
-    world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]]))[:3]
+    world = np.linalg.inv(view.world_to_camera)[:3]
     angle = math.degrees(2 * math.atan(0.5 * view.height / view.fy))
     return f"pose={','.join(f'{x:.9g}' for x in world.ravel())}&fov={angle:.6g}"
 

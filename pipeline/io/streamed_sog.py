@@ -22,6 +22,7 @@ from pipeline.io.sog import write_sog
 from pipeline.io.sog_container import META, Asset
 from pipeline.runtime.atomic import write_text
 from pipeline.runtime.json_file import JsonObject, Vector3
+from pipeline.runtime.progress import Progress
 from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianRows, collect
 from pipeline.splats.chunks import Chunk, box, chunks_of, levels_of
 
@@ -104,7 +105,9 @@ def write_streamed_sog(
         gaussians = replace(gaussians, rows=gaussians.rows[~sky])
         blocks = None if blocks is None else blocks[~sky]
     tree = chunks_of(gaussians.source.means, gaussians.rows, LEAF, blocks)
-    files = _Files(folder, antialias, [_Level() for _ in range(_num_levels(len(gaussians)))])
+    levels = [_Level() for _ in range(_num_levels(len(gaussians)))]
+    progress = Progress("writing levels of detail", len(gaussians), "Gaussians")
+    files = _Files(folder, antialias, levels, progress)
     root = _write_node(gaussians, tree, files)
     for level in range(len(files.levels)):
         files.flush(level)
@@ -148,6 +151,7 @@ class _Files:
     folder: Path
     antialias: bool
     levels: list[_Level]
+    progress: Progress
     names: list[str] = field(default_factory=list)
 
     def add(self, level: int, gaussians: GaussianArrays) -> Part:
@@ -183,6 +187,7 @@ def _write_node(gaussians: GaussianRows, chunk: Chunk, files: _Files) -> Node:
     for level, made in enumerate(levels_of(leaf, len(files.levels))):
         boxes.append(box(made, 1.0))
         lods[str(level)] = files.add(level, made)
+    files.progress.advance(len(leaf))
     return Node(bound=_bound(np.array(boxes)), lods=lods)
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.io.gltf import GAUSSIAN_SPLATTING, glb, splat_rendering
 from pipeline.io.spz import encode_spz
 from pipeline.runtime.atomic import write_bytes, write_json
+from pipeline.runtime.progress import Progress
 from pipeline.splats.arrays import GaussianArrays, GaussianRows, collect, joined
 from pipeline.splats.chunks import Chunk, box, chunks_of, in_z_order
 from pipeline.splats.levels import halved
@@ -47,12 +48,14 @@ class _Writer:
         folder: The folder of the tileset.
         gaussians: All Gaussians.
         antialias: As in ``write_tiles3d``.
+        progress: Counts the Gaussians of the leaves.
         written: The number of tiles that were written.
     """
 
     folder: Path
     gaussians: GaussianRows
     antialias: bool
+    progress: Progress
     written: int = field(default=0)
 
     def write(self, chunk: Chunk) -> tuple[dict[str, Any], GaussianArrays, Array]:
@@ -75,6 +78,7 @@ class _Writer:
             )
         else:
             own, boxes, error = collect(replace(self.gaussians, rows=chunk.rows)), [], 0.0
+            self.progress.advance(len(own))
         corners = np.stack([box(own, _REACH), *boxes])
         corners = np.stack([corners[:, 0].min(0), corners[:, 1].max(0)])
         own = in_z_order(own)
@@ -103,7 +107,8 @@ def write_tiles3d(
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
     """
     tree = chunks_of(gaussians.source.means, gaussians.rows, LEAF)
-    root, _, corners = _Writer(folder, gaussians, antialias).write(tree)
+    progress = Progress("writing tiles", len(gaussians), "Gaussians")
+    root, _, corners = _Writer(folder, gaussians, antialias, progress).write(tree)
     turned = np.eye(4)
     turned[:3, :3] = _TILE_OF_WORLD.T
     root["transform"] = (to_earth @ turned).T.ravel().tolist()

@@ -3,9 +3,9 @@
 ``lod-meta.json`` has a tree of boxes. Each leaf has its Gaussians at each level: level 0 has all of
 them, each further one half as many (``splats.levels``). A file, ``LEVEL_NUMBER/meta.json``, holds
 one level of neighbouring leaves. Viewers load the files of the levels that a camera needs. The
-coarsest level of the whole scene is one file, which a viewer can show first. ``env/meta.json`` has
-what is always shown: the sky. Sources: developer.playcanvas.com, "Streamed SOG", and the engine's
-loader (``gsplat-octree.js``).
+coarsest level of the whole scene is one small file, which a viewer can show first.
+``env/meta.json`` has what is always shown: the sky, where it has few Gaussians. Sources:
+developer.playcanvas.com, "Streamed SOG", and the engine's loader (``gsplat-octree.js``).
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ LEVELS = 5
 LEAF = 1 << 14
 #: The largest number of Gaussians of a file.
 FILE = 1 << 16
+#: The largest number of Gaussians of the environment, and of the coarsest level but for rounding up
+#: in each leaf. Viewers draw both in the first picture, also those without a GPU.
+FIRST_PICTURE = 1 << 13
 
 
 class Bound(JsonObject):
@@ -92,13 +95,16 @@ def write_streamed_sog(
         folder: The folder, which is made.
         gaussians: The Gaussians, at least one, in the world's axes.
         blocks: (N,) the number of the block of each of ``gaussians``: the first branches of the
-            tree. None for one block.
-        sky: (N,) whether each is always shown, without levels. It is ignored where these are more
-            than a file holds, or all.
+            tree, from 1 on. None for one block.
+        sky: (N,) whether each is sky, which is always shown and has no levels. Where it has more
+            than ``FIRST_PICTURE`` Gaussians, it is the first branch of the tree instead.
         antialias: Whether the Gaussians were trained with Mip-Splatting's opacity compensation.
     """
     environment = None
-    if sky is not None and 0 < sky.sum() <= min(FILE, len(gaussians) - 1):
+    if sky is not None and sky.sum() > FIRST_PICTURE:
+        # In leaves of the scene, the sky would make their boxes large.
+        blocks = np.where(sky, 0, 1 if blocks is None else blocks)
+    elif sky is not None and 0 < sky.sum() < len(gaussians):
         environment = ENVIRONMENT
         part = replace(gaussians, rows=gaussians.rows[sky])
         write_sog(folder / environment, part, antialias=antialias)
@@ -125,8 +131,7 @@ def write_streamed_sog(
 
 
 def _num_levels(count: int) -> int:
-    """As many levels as make the coarsest one half of a file, which leaves room for rounding."""
-    return max(LEVELS, 1 + (2 * count // FILE).bit_length())
+    return max(LEVELS, 1 + (count // FIRST_PICTURE).bit_length())
 
 
 @dataclass

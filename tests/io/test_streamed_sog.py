@@ -80,9 +80,9 @@ def test_the_coarsest_level_is_one_file(folder) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10**5, 2**17, 10**6, 3 * 10**7, 10**9])
-def test_scenes_of_any_size_have_levels_until_one_file_holds_the_coarsest(count) -> None:
+def test_scenes_of_any_size_have_levels_until_the_first_picture_is_small(count) -> None:
     levels = streamed_sog._num_levels(count)
-    assert levels >= LEVELS and count / 2 ** (levels - 1) <= streamed_sog.FILE / 2
+    assert levels >= LEVELS and count / 2 ** (levels - 1) <= streamed_sog.FIRST_PICTURE
 
 
 def test_each_leaf_holds_its_gaussians_in_its_box(folder) -> None:
@@ -134,15 +134,25 @@ def test_the_sky_is_the_environment_and_in_no_leaf(tmp_path) -> None:
     assert np.abs(meta["tree"]["bound"]["max"]).max() < np.abs(gaussians.means[50:]).max()
 
 
-@pytest.mark.parametrize("share", ["none", "all", "more than a file"])
-def test_there_is_no_environment_without_sky_or_scene(tmp_path, monkeypatch, share) -> None:
-    if share == "more than a file":
-        monkeypatch.setattr(streamed_sog, "FILE", 20)
-        monkeypatch.setattr(streamed_sog, "LEAF", 20)
-    sky = np.arange(40) < {"none": 0, "all": 40, "more than a file": 21}[share]
+@pytest.mark.parametrize("share", [0, 40])
+def test_there_is_no_environment_without_sky_or_scene(tmp_path, share) -> None:
+    sky = np.arange(40) < share
     write_streamed_sog(tmp_path, reduce_gaussians(sample(40, 0).as_arrays(), 3, 0.0, True), sky=sky)
     meta = read_meta(tmp_path)
     assert "environment" not in meta and meta["counts"][0] == 40
+
+
+@pytest.mark.parametrize("blocks", [None, np.repeat([1, 2], 20)])
+def test_a_large_sky_is_the_first_branch_of_the_tree(tmp_path, monkeypatch, blocks) -> None:
+    """The first picture stays small, and the boxes of other leaves too."""
+    monkeypatch.setattr(streamed_sog, "FIRST_PICTURE", 10)
+    sky = np.arange(40) % 2 == 1
+    rows = reduce_gaussians(sample(40, 0).as_arrays(), 3, 0.0, True)
+    write_streamed_sog(tmp_path, rows, sky=sky, blocks=blocks)
+    meta = read_meta(tmp_path)
+    assert "environment" not in meta and meta["counts"][0] == 40
+    counts = [branch["lods"]["0"]["count"] for branch in meta["tree"]["children"]]
+    assert counts == ([20, 20] if blocks is None else [20, 10, 10])
 
 
 def test_a_scene_of_one_gaussian_is_written(tmp_path) -> None:

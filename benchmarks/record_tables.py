@@ -33,6 +33,7 @@ from benchmarks.results import (
     PageResult,
     PoseOutcome,
     PoseResult,
+    PrunedResult,
     ScalingResult,
     SerialResult,
     SlurmResult,
@@ -152,6 +153,24 @@ def page_table(found: Sequence[PageResult]) -> str:
         times = (r.arrived_s, r.first_s, r.slowest_first_s, r.first_after_arrival_s, r.own_s)
         seconds = (f"{value:.1f}" for value in times)
         rows.append([r.page, count, f"{r.page_mb:.1f}", *seconds, f"{r.frames_per_s:.1f}"])
+    return markdown.table(rows)
+
+
+def pruned_table(found: Sequence[PrunedResult]) -> str:
+    """A row for each file. Changes are against the first file of the same scene and training."""
+    rows = [
+        [
+            *("scene", "training", "test views, pixels", "Gaussians", "share"),
+            *("PSNR (dB)", "change (dB)", "SSIM"),
+        ]
+    ]
+    whole: dict[tuple[str, str], PrunedResult] = {}
+    for r in found:
+        all_ = whole.setdefault((r.scene, r.training), r)
+        share, change = r.gaussians / all_.gaussians, r.psnr - all_.psnr
+        size = (f"{r.views}, {r.pixels}", f"{r.gaussians:,}", f"{share:.2f}")
+        changed = "-" if r is all_ else f"{change:+.2f}"
+        rows.append([r.scene, r.training, *size, f"{r.psnr:.2f}", changed, f"{r.ssim:.4f}"])
     return markdown.table(rows)
 
 
@@ -390,6 +409,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
     "surface": (SurfaceResult, surface),
     "levels": (LevelResult, levels),
     "page": (PageResult, page_table),
+    "pruned": (PrunedResult, pruned_table),
     "streamed": (StreamedResult, streamed_table),
     "georeference": (GeoreferenceResult, verdicts_table),
     "pose_conventions": (PoseResult, poses_table),

@@ -532,6 +532,28 @@ class LevelResult:
 
 
 @dataclass(frozen=True)
+class PrunedResult:
+    """A file of a scene's Gaussians, by ``benchmarks.pruned``. The first of a record has all.
+
+    Attributes:
+        scene: The name of the scene.
+        training: How the scene was trained.
+        gaussians: The number of Gaussians of the file.
+        views: The number of test views.
+        pixels: Their size.
+        psnr, ssim: The means over the test views, against the photographs; PSNR in dB.
+    """
+
+    scene: str
+    training: str
+    gaussians: int
+    views: int
+    pixels: str
+    psnr: float
+    ssim: float
+
+
+@dataclass(frozen=True)
 class StreamedResult:
     """How a browser loads a Streamed SOG with another program's engine, by ``benchmarks.streamed``.
     Times are medians over runs, in seconds since the navigation began.

@@ -27,6 +27,7 @@ from benchmarks.results import (
     NovelViewResult,
     PageResult,
     PoseResult,
+    PrunedResult,
     ScalingResult,
     SerialResult,
     SlurmResult,
@@ -144,6 +145,10 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     "page": (
         PageResult("garden", 1_000_000, 12.94, 5, 1.4, 2.5, 1.1, 3.0, 7.25, 8.0),
         "| garden | 1,000,000 | 12.9 | 1.4 | 2.5 | 3.0 | 1.1 | 7.2 | 8.0 |",
+    ),
+    "pruned": (
+        PrunedResult("room", "as published", 900_000, 37, "800x533", 28.794, 0.9036),
+        "| room | as published | 37, 800x533 | 900,000 | 1.00 | 28.79 | - | 0.9036 |",
     ),
     "streamed": (
         StreamedResult(

@@ -63,13 +63,15 @@ def measure(scene: Scene, backend: GpuBackend, steps: int) -> tuple[GpuCountsRes
 
 def counted_steps(backend: GpuBackend, scene: StepScene, steps: int) -> tuple[Counts, float]:
     """The counts of ``steps`` training steps, and the seconds of one in the thread that records."""
-    step = training_step(backend, scene, steps)
-    step()  # Allocates memory and compiles kernels.
-    gpu = backend.gpu
-    gpu.counts = counts = Counts(traffic=Traffic())
+    make_steps, gpu = training_step(backend, scene), backend.gpu
+    # One step compiles the kernels and finds the number of pairs, by which their room is set.
+    make_steps(1)
+    gpu.counts = counts = Counts(pairs=gpu.counts.pairs, traffic=Traffic())
     start = time.thread_time()
-    step()
-    return counts, (time.thread_time() - start) / steps
+    make_steps(steps)
+    seconds = time.thread_time() - start
+    gpu.counts = Counts(pairs=counts.pairs)
+    return counts, seconds / steps
 
 
 def main() -> int:

@@ -252,8 +252,9 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
     """
     p, gpu = visible.projection, space.gpu
     count, (tiles_x, tiles_y) = p.scene.count, layout.tiles_of(*p.size)
-    keys = space.get("tiles of pairs", 4 * capacity)
-    gaussian_of = space.get("Gaussians of pairs", 4 * capacity)
+    used = gpu.counts.listed(capacity)
+    keys = space.get("tiles of pairs", 4 * capacity, 4 * used)
+    gaussian_of = space.get("Gaussians of pairs", 4 * capacity, 4 * used)
     slots = space.get("slots of Gaussians", 4 * count)
     space.run(
         "pairs",
@@ -271,7 +272,7 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
         slots=slots,
     )
     bits = (tiles_x * tiles_y).bit_length()
-    pairs = sort(space, "pairs", keys, length, capacity=capacity, bits=bits)
+    pairs = sort(space, "pairs", keys, length, capacity=capacity, bits=bits, used=used)
     arrays = {"keys": pairs.keys, "ranges": visible.ranges}
     space.run("ranges", blocks(capacity), length=pairs.count, **arrays)
     return Lists(p, capacity, gaussian_of, pairs.order, visible.ranges, slots)
@@ -323,7 +324,10 @@ def backward(
     """
     lists, projection = image.lists, image.lists.projection
     scene = projection.scene
-    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.capacity)
+    used = space.gpu.counts.listed(lists.capacity)
+    slots = space.get(
+        "slots of gradients", layout.SLOT_BYTES * lists.capacity, layout.SLOT_BYTES * used
+    )
     _run_in_bands(
         space, "blend_backward", lists, color=image.color, planes=image.planes, ends=image.ends,
         d_color=d_color, d_planes=d_planes, slots=slots,
@@ -361,4 +365,4 @@ def _run_in_bands(space: Workspace, kernel: str, lists: Lists, **buffers: Buffer
             space.gpu.submit()
         band = across, min(rows, down - first), 1
         first_row = space.gpu.uniform("I", first)
-        space.run(kernel, band, first_row=first_row, **lists.by_tile, **buffers)
+        space.run(kernel, band, band[1] / down, first_row=first_row, **lists.by_tile, **buffers)

@@ -195,7 +195,7 @@ class GpuTraining(ResidentTraining):
         for name, words in self._sizes(step).items():
             at[name] = end
             end += words
-        results = space.get("results", 4 * max(RESULT_WORDS, end))
+        results = space.get("results", 4 * max(RESULT_WORDS, end), 4 * (end - at["totals"]))
         length = rasterise.admit(
             space, visible, self._capacity, self.stopped, results, at["totals"]
         )
@@ -256,6 +256,7 @@ class GpuTraining(ResidentTraining):
     def _make_room(self, totals: Sequence[Totals]) -> None:
         """Give the next steps room by the pairs of the last ones."""
         self._pairs.extend(each.pairs for each in totals)
+        self.gpu.counts.pairs = self._pairs[-1]
         most = max(self._pairs)
         if LEAST_ROOM * most <= self._capacity <= max(MIN_CAPACITY, MOST_ROOM * most):
             return

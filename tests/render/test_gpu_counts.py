@@ -78,8 +78,8 @@ def test_uses_of_buffers_are_read_from_the_kernels() -> None:
     assert found["gradients"] == Use(read=False, written=True)
     assert found["exp_avg"] == found["sh"] == Use(read=True, written=True)
     assert found["slots"] == Use(read=True, written=False)
-    forward, backward = kernels.uses("loss.forward"), kernels.uses("loss.backward")
-    assert forward["derivatives"] == Use(read=False, written=True)
-    assert backward["derivatives"] == Use(read=True, written=False)
-    assert forward["gradient"] == Use(read=False, written=False)
+    forward, backward = kernels.uses("compose.compose"), kernels.uses("compose.backward")
+    assert forward["front"] == Use(read=True, written=False)
+    assert backward["front"] == forward["d_alpha"] == Use(read=False, written=False)
+    assert backward["d_alpha"] == Use(read=False, written=True)
     assert kernels.uses("project")["dropped"] == Use(read=True, written=True)  # atomic

@@ -39,7 +39,7 @@ def test_steps_do_not_wait_for_the_device(counts: Counts) -> None:
 
 
 def test_a_step_takes_few_dispatches(counts: Counts) -> None:
-    assert counts.dispatches <= 27 * STEPS
+    assert counts.dispatches <= 26 * STEPS
     assert counts.copies == 0
     assert counts.submissions <= 2 * STEPS
 
@@ -52,6 +52,19 @@ def test_moments_are_read_and_written_once(counts: Counts) -> None:
     for name, width in floats.items():
         expected = 4 * width * GAUSSIANS * STEPS
         assert traffic.read[name] == traffic.written[name] == expected, name
+
+
+def test_images_are_moved_few_times(counts: Counts) -> None:
+    """The loss and its gradient read the image once. A default step has no alpha and depths, and no
+    gradients on them."""
+    traffic = counts.traffic
+    assert traffic is not None
+    pixel = 48 * 64 * STEPS
+    assert traffic.written["image"] == traffic.written["gradient of the image"] == 12 * pixel
+    assert traffic.read["image"] == 24 * pixel and traffic.read["a training image"] == 3 * pixel
+    assert traffic.read["gradient of the image"] == 12 * pixel
+    planes = {"alpha and depths", "zeros", "gradients of alpha and depth", "derivatives of SSIM"}
+    assert not planes & (traffic.read.keys() | traffic.written.keys())
 
 
 def test_the_pairs_of_the_scene_are_counted_not_their_room(counts: Counts) -> None:

@@ -34,7 +34,7 @@ PHASES = {
     "projection, SH": ("project",),
     "bin": ("sort.histogram", "sort.scan", "sort.scatter", "order", "admit", "pairs", "ranges"),
     "blend": ("blend",),
-    "loss": ("loss.forward", "loss.backward", "sum_rows"),
+    "loss": ("loss", "sum_rows"),
     "blend backward": ("blend_backward",),
     "projection backward": ("project_backward",),
     "Adam, statistics": ("optimise",),

@@ -253,7 +253,7 @@ class GpuCountsResult:
 
     Attributes:
         pairs: The number of (Gaussian, tile) pairs.
-        steps: The number of steps that were counted.
+        steps: The number of steps of a small scene whose waits were counted.
         waits: The number of times that the processor waited for the device in all of them.
         dispatches, copies, submissions: Of kernels, of copies and clears of buffers, and of command
             buffers, in a step.

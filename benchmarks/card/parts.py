@@ -135,7 +135,7 @@ def frames(case: Case) -> Found:
     def draw() -> None:
         for _ in range(count):
             view = rasterise.project(space, projected.scene, projected.view, case.size)
-            image = rasterise.blend(space, rasterise.list_pairs(space, view)[0])
+            image = rasterise.blend(space, rasterise.list_pairs(space, view)[0], planes=True)
         gpu.read(image.color, "f4", 1)
 
     def copied() -> object:

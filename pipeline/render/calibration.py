@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -42,6 +42,13 @@ class StepScene:
     target: Tensor
 
 
+class Steps(Protocol):
+    """A function that makes training steps."""
+
+    def __call__(self, steps: int = 1) -> None:
+        """Make ``steps`` steps, then wait for them."""
+
+
 def step_seconds(backend: Backend, gaussians: int = GAUSSIANS, steps: int = STEPS) -> float:
     """Median time of a training step of a synthetic scene, in seconds."""
     step = training_step(backend, made_scene(gaussians))
@@ -75,13 +82,12 @@ def made_scene(count: int) -> StepScene:
     return StepScene(gaussians, camera, (255 * uniform(HEIGHT, WIDTH, 3)).to(torch.uint8))
 
 
-def training_step(backend: Backend, scene: StepScene, steps: int = 1) -> Callable[[], object]:
-    """Return a function that makes ``steps`` steps and waits for them, which can be repeated. The
-    operators of a backend make one step."""
+def training_step(backend: Backend, scene: StepScene) -> Steps:
+    """Return a function that makes steps and waits for them, which can be repeated."""
     training = backend.resident()
     if training is None:
         return _by_operators(backend, scene, _optimised(scene))
-    return _resident(training, scene, _optimised(scene), steps)
+    return _resident(training, scene, _optimised(scene))
 
 
 def _optimised(scene: StepScene) -> Optimised:
@@ -94,9 +100,7 @@ def _optimised(scene: StepScene) -> Optimised:
     return Optimised(parameters, first, second, last, torch.zeros(count), torch.zeros(count))
 
 
-def _resident(
-    training: ResidentTraining, scene: StepScene, state: Optimised, steps: int
-) -> Callable[[], object]:
+def _resident(training: ResidentTraining, scene: StepScene, state: Optimised) -> Steps:
     training.load(state)
     step = ResidentStep(
         camera=scene.camera,
@@ -111,15 +115,15 @@ def _resident(
         adam={"frames": TWO_RATES, "sh": TWO_RATES, **dict.fromkeys(DENSE, RATE)},
     )
 
-    def step_and_wait() -> None:
+    def make(steps: int = 1) -> None:
         for _ in range(steps):
             training.step(step)
         training.results()
 
-    return step_and_wait
+    return make
 
 
-def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Callable[[], object]:
+def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Steps:
     means, log_scales, quats, _, _ = scene.gaussians
     moments = {name: Moments(state.first[name], state.second[name]) for name in NAMES}
     harmonics = ShAdam(moments["sh"], state.last, TWO_RATES)
@@ -133,4 +137,8 @@ def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Calla
         for name in DENSE:
             backend.adam_step(state.parameters[name], getattr(g, name), moments[name], RATE)
 
-    return step
+    def make(steps: int = 1) -> None:
+        for _ in range(steps):
+            step()
+
+    return make

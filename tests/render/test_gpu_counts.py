@@ -9,7 +9,7 @@ import torch
 from benchmarks.gpu_counts import counted_steps
 from pipeline.render import make_backend
 from pipeline.render.calibration import StepScene
-from pipeline.render.gpu import kernels, resident
+from pipeline.render.gpu import kernels, layout, rasterise, resident
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.counts import Counts
 from pipeline.render.gpu.kernels import Use
@@ -19,14 +19,18 @@ from tests.tools import need_gpu
 STEPS, GAUSSIANS = 20, 1500
 
 
-@pytest.fixture(scope="module")
-def counts() -> Counts:
+def counted(steps: int) -> Counts:
     need_gpu()
     backend = make_backend("gpu")
     assert isinstance(backend, GpuBackend)
     target = torch.zeros(48, 64, 3, dtype=torch.uint8)
     scene = StepScene(random_scene(1, GAUSSIANS), camera(64, 48), target)
-    return counted_steps(backend, scene, STEPS)[0]
+    return counted_steps(backend, scene, steps)[0]
+
+
+@pytest.fixture(scope="module")
+def counts() -> Counts:
+    return counted(STEPS)
 
 
 def test_steps_do_not_wait_for_the_device(counts: Counts) -> None:
@@ -35,7 +39,7 @@ def test_steps_do_not_wait_for_the_device(counts: Counts) -> None:
 
 
 def test_a_step_takes_few_dispatches(counts: Counts) -> None:
-    assert counts.dispatches <= 27 * STEPS
+    assert counts.dispatches <= 26 * STEPS
     assert counts.copies == 0
     assert counts.submissions <= 2 * STEPS
 
@@ -50,12 +54,36 @@ def test_moments_are_read_and_written_once(counts: Counts) -> None:
         assert traffic.read[name] == traffic.written[name] == expected, name
 
 
-def test_pairs_have_little_room(counts: Counts) -> None:
-    """The kernels of pairs run over the room of their arrays, not over what is allocated."""
+def test_images_are_moved_few_times(counts: Counts) -> None:
+    """The loss and its gradient read the image once. A default step has no alpha and depths, and no
+    gradients on them."""
     traffic = counts.traffic
     assert traffic is not None
-    pairs = traffic.written["Gaussians of pairs"] / 4 / STEPS
-    assert pairs <= max(resident.MIN_CAPACITY, 4 * GAUSSIANS)
+    pixel = 48 * 64 * STEPS
+    assert traffic.written["image"] == traffic.written["gradient of the image"] == 12 * pixel
+    assert traffic.read["image"] == 24 * pixel and traffic.read["a training image"] == 3 * pixel
+    assert traffic.read["gradient of the image"] == 12 * pixel
+    planes = {"alpha and depths", "zeros", "gradients of alpha and depth", "derivatives of SSIM"}
+    assert not planes & (traffic.read.keys() | traffic.written.keys())
+
+
+def test_the_pairs_of_the_scene_are_counted_not_their_room(counts: Counts) -> None:
+    traffic = counts.traffic
+    assert traffic is not None and counts.pairs is not None
+    assert GAUSSIANS < counts.pairs < resident.MIN_CAPACITY
+    assert traffic.written["Gaussians of pairs"] == 4 * counts.pairs * STEPS
+    expected = layout.SLOT_BYTES * counts.pairs * STEPS
+    assert traffic.written["slots of gradients"] == traffic.read["slots of gradients"] == expected
+
+
+def test_the_bands_of_an_image_count_it_once(
+    monkeypatch: pytest.MonkeyPatch, counts: Counts
+) -> None:
+    monkeypatch.setattr(rasterise, "TILES_OF_BAND", 4)
+    bands = counted(1)
+    assert bands.traffic is not None and counts.traffic is not None
+    assert bands.dispatches == counts.dispatches / STEPS + 4
+    assert bands.traffic.total == pytest.approx(counts.traffic.total / STEPS, rel=1e-4)
 
 
 def test_uses_of_buffers_are_read_from_the_kernels() -> None:
@@ -63,8 +91,8 @@ def test_uses_of_buffers_are_read_from_the_kernels() -> None:
     assert found["gradients"] == Use(read=False, written=True)
     assert found["exp_avg"] == found["sh"] == Use(read=True, written=True)
     assert found["slots"] == Use(read=True, written=False)
-    forward, backward = kernels.uses("loss.forward"), kernels.uses("loss.backward")
-    assert forward["derivatives"] == Use(read=False, written=True)
-    assert backward["derivatives"] == Use(read=True, written=False)
-    assert forward["gradient"] == Use(read=False, written=False)
+    forward, backward = kernels.uses("compose.compose"), kernels.uses("compose.backward")
+    assert forward["front"] == Use(read=True, written=False)
+    assert backward["front"] == forward["d_alpha"] == Use(read=False, written=False)
+    assert backward["d_alpha"] == Use(read=False, written=True)
     assert kernels.uses("project")["dropped"] == Use(read=True, written=True)  # atomic

@@ -127,7 +127,7 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def blend(self, binned: Binned) -> Forward:
         gpu, totals, projected = self.gpu, binned.totals, binned.projected
-        image = rasterise.blend(Workspace(gpu), binned.lists)
+        image = rasterise.blend(Workspace(gpu), binned.lists, planes=True)
         alpha = image.plane(gpu, 0)
         color = torch.from_numpy(gpu.read(image.color, np.float32, 3 * alpha.numel()))
         return Forward(

@@ -28,7 +28,9 @@ class Traffic:
     buffers.
 
     A kernel that uses a buffer counts as if it read or wrote each byte in use once. Kernels
-    that gather the same record several times read more, and kernels that leave early less.
+    that gather the same record several times read more, and kernels that leave early less. The
+    bands of an image, which are dispatches of their own, count together once: each by its share of
+    the tiles. Of the arrays of pairs, the bytes of ``Counts.pairs`` pairs are in use.
 
     Attributes:
         used: The bytes of the buffers in use, where these are fewer than all.
@@ -42,9 +44,10 @@ class Traffic:
     def total(self) -> int:
         return self.read.total() + self.written.total()
 
-    def add_kernel(self, group: BindGroup) -> None:
+    def add_kernel(self, group: BindGroup, share: float) -> None:
         for use, buffer in group.buffers:
-            size = min(buffer.size, self.used.get(buffer.label, buffer.size))
+            used = min(buffer.size, self.used.get(buffer.label, buffer.size))
+            size = round(share * used)
             if use.written:
                 self.written[buffer.label] += size
             if use.read:
@@ -61,6 +64,8 @@ class Counts:
         copies: The number of copies and clears of buffers, which interrupt a pass.
         submissions: The number of submitted command buffers.
         uploaded, downloaded: Bytes copied to the device and from it.
+        pairs: The number of (Gaussian, tile) pairs of the last step whose results were read; None:
+            it is not known, and arrays of pairs count with all their room.
         traffic: None: it is not counted, which takes time.
     """
 
@@ -70,6 +75,7 @@ class Counts:
     submissions: int = 0
     uploaded: int = 0
     downloaded: int = 0
+    pairs: int | None = None
     traffic: Traffic | None = None
 
     def use(self, name: str, size: int) -> None:
@@ -77,11 +83,15 @@ class Counts:
         if self.traffic is not None:
             self.traffic.used[name] = size
 
-    def add_dispatch(self, group: BindGroup) -> None:
-        """Count a kernel with its buffers."""
+    def listed(self, capacity: int) -> int:
+        """The number of pairs in use in arrays with room for ``capacity``."""
+        return capacity if self.pairs is None else min(self.pairs, capacity)
+
+    def add_dispatch(self, group: BindGroup, share: float) -> None:
+        """Count a kernel that uses this share of its buffers."""
         self.dispatches += 1
         if self.traffic is not None:
-            self.traffic.add_kernel(group)
+            self.traffic.add_kernel(group, share)
 
     def add_copy(self, source: Any, target: Any, size: int) -> None:
         """Count a copy; ``source`` is None if the buffer is cleared."""

@@ -253,8 +253,14 @@ class Gpu:
         used = uses(kernel)
         return BindGroup(group, tuple((used[name], buffer) for name, buffer in buffers.items()))
 
-    def dispatch(self, kernel: str, groups: int | tuple[int, int, int], bound: BindGroup) -> None:
-        """Record a kernel with the result of ``bind``."""
+    def dispatch(
+        self,
+        kernel: str,
+        groups: int | tuple[int, int, int],
+        bound: BindGroup,
+        share: float = 1.0,
+    ) -> None:
+        """Record a kernel with the result of ``bind``; ``share`` as of ``Workspace.run``."""
         if groups == 0:
             return
         if isinstance(groups, int):
@@ -269,7 +275,7 @@ class Gpu:
         self._pass.set_pipeline(self._pipeline(kernel)[0])
         self._pass.set_bind_group(0, bound.group)
         self._pass.dispatch_workgroups(*groups)
-        self.counts.add_dispatch(bound)
+        self.counts.add_dispatch(bound, share)
 
     def clear(self, buffer: Buffer) -> None:
         """Fill a buffer with zeros."""

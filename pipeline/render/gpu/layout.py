@@ -25,6 +25,7 @@ ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
 BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
 FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
 SH_ADAM, CAMERA = 1, 2  # flags of Adam in project_backward.wgsl
+PLANES = 1  # flag of Band in band.wgsl
 FRAMES = 1  # flag of Options in optimise.wgsl
 
 # The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the

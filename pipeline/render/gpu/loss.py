@@ -33,7 +33,7 @@ class LossImage:
     mask: Buffer | None
     count: int
     is_bytes: bool
-    _groups: dict[str, tuple[tuple[int, ...], BindGroup]] = field(default_factory=dict)
+    _groups: dict[tuple[int, ...], BindGroup] = field(default_factory=dict)
 
     @staticmethod
     def upload(gpu: Gpu, target: Tensor, mask: Tensor | None) -> LossImage:
@@ -51,13 +51,14 @@ class LossImage:
         masked = {} if self.mask is None else {"mask": self.mask}
         return {"target_words": self.target, **masked}
 
-    def run(self, gpu: Gpu, kernel: str, groups: tuple[int, int, int], **buffers: Buffer) -> None:
-        """Run a kernel as ``Workspace.run`` does. The bind groups are kept with the image: those of
-        a workspace would keep all images in memory."""
+    def run(self, gpu: Gpu, groups: tuple[int, int, int], **buffers: Buffer) -> None:
+        """Run the kernel ``loss`` as ``Workspace.run`` does. The bind group is kept with the image:
+        one of a workspace would keep all images in memory."""
         key = tuple(map(id, buffers.values()))
-        if kernel not in self._groups or self._groups[kernel][0] != key:
-            self._groups[kernel] = key, gpu.bind(kernel, buffers)
-        gpu.dispatch(kernel, groups, self._groups[kernel][1])
+        if key not in self._groups:
+            self._groups.clear()
+            self._groups[key] = gpu.bind("loss", buffers)
+        gpu.dispatch("loss", groups, self._groups[key])
 
 
 @dataclass(frozen=True)
@@ -89,20 +90,18 @@ def l1_ssim(
     gain: Gain = NO_GAIN,
 ) -> LossSums:
     """The loss of ``Backend.l1_ssim``, of the rendered image times ``gain``."""
-    pixels, tiles = size[0] * size[1], layout.tiles_of(*size)
+    tiles = layout.tiles_of(*size)
     rows, count = 3 * tiles[0] * tiles[1], max(1, image.count)
     flags = layout.BYTES * image.is_bytes + layout.MASKED * (image.mask is not None)
     scales = (1 - ssim_weight) / count, -ssim_weight / count
     arguments = {
         "loss": space.gpu.uniform("4I8f", *size, flags, 0, l2_weight, *scales, 0.0, *gain, 0.0),
         "rendered": rendered,
-        "derivatives": space.get("derivatives of SSIM", 36 * pixels),
-        "gradient": space.get("gradient of the image", 12 * pixels),
+        "gradient": space.get("gradient of the image", 12 * size[0] * size[1]),
         "sums": space.get("sums of the loss", 16 * rows),
         **image.buffers,
     }
-    image.run(space.gpu, "loss.forward", (*tiles, 3), **arguments)
-    image.run(space.gpu, "loss.backward", (*tiles, 3), **arguments)
+    image.run(space.gpu, (*tiles, 3), **arguments)
     return LossSums(arguments["gradient"], arguments["sums"], rows, image.count)
 
 

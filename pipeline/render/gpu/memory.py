@@ -10,7 +10,7 @@ from pipeline.render.resident import TrainingSize
 PAIRS_PER_GAUSSIAN = 8
 # The bytes of a Gaussian (counts, radii and ranks), of a pair (keys and values of sorting) and of a
 # pixel (images and their gradients) in the arrays that are not the largest.
-GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 48, 20, 48
+GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 48, 20, 36
 
 
 def large_arrays(size: TrainingSize) -> dict[str, int]:
@@ -20,7 +20,7 @@ def large_arrays(size: TrainingSize) -> dict[str, int]:
         "SH coefficients": 12 * size.sh_coefficients * count,
         "gradients": 4 * layout.floats(layout.GRADIENTS) * count,
         "slots of gradients": layout.SLOT_BYTES * PAIRS_PER_GAUSSIAN * count,
-        "derivatives of SSIM": 36 * size.pixels,
+        "image": 12 * size.pixels,
     }
 
 

@@ -32,7 +32,14 @@ class Sorted:
 
 
 def sort(
-    space: Workspace, name: str, keys: Buffer, length: Buffer, *, capacity: int, bits: int
+    space: Workspace,
+    name: str,
+    keys: Buffer,
+    length: Buffer,
+    *,
+    capacity: int,
+    bits: int,
+    used: int | None = None,
 ) -> Sorted:
     """Sort the indices of uint32 keys of at most ``bits`` bits by their keys. Keys of zero are left
     out; equal keys keep their order.
@@ -42,21 +49,25 @@ def sort(
             this name, its keys until the next sort.
         keys: They are overwritten.
         length: One uint32, the number of keys, which is at most ``capacity``.
+        used: The number of keys for the counts; None: ``capacity``.
     """
     groups, size = max(1, blocks(capacity, BLOCK)), 4 * capacity
-    places = space.get("places of digits", 4 * DIGITS * groups)
+    used = capacity if used is None else used
+    places = space.get("places of digits", 4 * DIGITS * groups, 4 * DIGITS * blocks(used, BLOCK))
     totals = space.get("numbers of digits", 4 * DIGITS)
     count = space.get(f"number of {name}", 4)
-    other_keys = space.get("sort keys", size)
-    order, other_order = space.get(f"order of {name}", size), space.get("sort order", size)
+    other_keys = space.get("sort keys", size, 4 * used)
+    order, other_order = (
+        space.get(each, size, 4 * used) for each in (f"order of {name}", "sort order")
+    )
     passes = blocks(bits, DIGIT_BITS)
     if passes % 2 == 0:  # The last pass writes to the order of this name.
         order, other_order = other_order, order
     for each in range(passes):
-        pass_, used = space.gpu.uniform("I", DIGIT_BITS * each), count if each else length
-        both = {"pass_": pass_, "length": used, "keys": keys, "places": places}
+        pass_, number = space.gpu.uniform("I", DIGIT_BITS * each), count if each else length
+        both = {"pass_": pass_, "length": number, "keys": keys, "places": places}
         space.run("sort.histogram", groups, **both)
-        space.run("sort.scan", DIGITS // SCANNED, length=used, places=places, totals=totals)
+        space.run("sort.scan", DIGITS // SCANNED, length=number, places=places, totals=totals)
         more = {"order": other_order} if each else {"count": count}
         space.run(
             "sort.scatter", groups, **both, **more, totals=totals, sorted_keys=other_keys,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,17 +159,18 @@ class Image:
 
     Attributes:
         color: (H, W, 3).
-        planes: (3, H, W), alpha, depth and median depth.
+        planes: (3, H, W), alpha, depth and median depth; None if they were not asked for.
         ends: (H, W), see blend.wgsl.
     """
 
     lists: Lists
     color: Buffer
-    planes: Buffer
+    planes: Buffer | None
     ends: Buffer
 
     def plane(self, gpu: Gpu, number: int) -> Tensor:
         """(H, W), a copy of one of the planes."""
+        assert self.planes is not None
         width, height = self.lists.projection.size
         pixels = width * height
         found = gpu.read(self.planes, np.float32, pixels, 4 * pixels * number)
@@ -252,8 +254,9 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
     """
     p, gpu = visible.projection, space.gpu
     count, (tiles_x, tiles_y) = p.scene.count, layout.tiles_of(*p.size)
-    keys = space.get("tiles of pairs", 4 * capacity)
-    gaussian_of = space.get("Gaussians of pairs", 4 * capacity)
+    used = gpu.counts.listed(capacity)
+    keys = space.get("tiles of pairs", 4 * capacity, 4 * used)
+    gaussian_of = space.get("Gaussians of pairs", 4 * capacity, 4 * used)
     slots = space.get("slots of Gaussians", 4 * count)
     space.run(
         "pairs",
@@ -271,7 +274,7 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
         slots=slots,
     )
     bits = (tiles_x * tiles_y).bit_length()
-    pairs = sort(space, "pairs", keys, length, capacity=capacity, bits=bits)
+    pairs = sort(space, "pairs", keys, length, capacity=capacity, bits=bits, used=used)
     arrays = {"keys": pairs.keys, "ranges": visible.ranges}
     space.run("ranges", blocks(capacity), length=pairs.count, **arrays)
     return Lists(p, capacity, gaussian_of, pairs.order, visible.ranges, slots)
@@ -292,23 +295,25 @@ def list_pairs(space: Workspace, projection: Projection) -> tuple[Lists, Totals]
     return fill_lists(space, visible, length, totals.pairs), totals
 
 
-def blend(space: Workspace, lists: Lists) -> Image:
-    """Composite the image."""
+def blend(space: Workspace, lists: Lists, *, planes: bool) -> Image:
+    """Composite the image.
+
+    Args:
+        planes: Whether alpha and depths are written.
+    """
     width, height = lists.projection.size
-    arrays = {
-        "color": space.get("image", 12 * width * height),
-        "planes": space.get("alpha and depths", 12 * width * height),
-        "ends": space.get("ends of pixels", 4 * width * height),
-    }
-    _run_in_bands(space, "blend", lists, **arrays)
-    return Image(lists, **arrays)
+    color = space.get("image", 12 * width * height)
+    ends = space.get("ends of pixels", 4 * width * height)
+    found = space.get("alpha and depths", 12 * width * height) if planes else None
+    _run_in_bands(space, "blend", lists, {"planes": found}, color=color, ends=ends)
+    return Image(lists, color, found, ends)
 
 
 def backward(
     space: Workspace,
     image: Image,
     d_color: Buffer,
-    d_planes: Buffer,
+    d_planes: Buffer | None,
     rates: AdamRates | None,
     **more: Buffer,
 ) -> Buffer:
@@ -316,6 +321,7 @@ def backward(
     colour (H, W, 3) and on alpha and depth (2, H, W).
 
     Args:
+        d_planes: None: they are zero. Otherwise, the image needs its planes.
         rates: The rates of ``ShAdam``, which updates the SH coefficients; None: it does not.
         more: ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH coefficients that are updated, or
             ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients; ``stopped``
@@ -323,10 +329,14 @@ def backward(
     """
     lists, projection = image.lists, image.lists.projection
     scene = projection.scene
-    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.capacity)
+    used = space.gpu.counts.listed(lists.capacity)
+    slots = space.get(
+        "slots of gradients", layout.SLOT_BYTES * lists.capacity, layout.SLOT_BYTES * used
+    )
+    planes = {"planes": None if d_planes is None else image.planes, "d_planes": d_planes}
     _run_in_bands(
-        space, "blend_backward", lists, color=image.color, planes=image.planes, ends=image.ends,
-        d_color=d_color, d_planes=d_planes, slots=slots,
+        space, "blend_backward", lists, planes, color=image.color, ends=image.ends,
+        d_color=d_color, slots=slots,
     )  # fmt: skip
     flags = layout.SH_ADAM * (rates is not None) | layout.CAMERA * ("d_camera" in more)
     gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
@@ -352,13 +362,24 @@ def camera_gradients(total: NDArray[np.float64]) -> CameraGradients:
     return CameraGradients(*torch.from_numpy(total).split([3, 3, 2, 2]))
 
 
-def _run_in_bands(space: Workspace, kernel: str, lists: Lists, **buffers: Buffer) -> None:
-    """Run a kernel of tiles in bands of at most ``TILES_OF_BAND`` tiles."""
+def _run_in_bands(
+    space: Workspace,
+    kernel: str,
+    lists: Lists,
+    planes: Mapping[str, Buffer | None],
+    **buffers: Buffer,
+) -> None:
+    """Run a kernel of tiles in bands of at most ``TILES_OF_BAND`` tiles, with all of ``planes`` or
+    with none."""
+    given = {name: buffer for name, buffer in planes.items() if buffer is not None}
+    assert not given or len(given) == len(planes)
+    flags = layout.PLANES if given else 0
     across, down = layout.tiles_of(*lists.projection.size)
     rows = max(1, TILES_OF_BAND // across)
     for first in range(0, down, rows):
         if first:
             space.gpu.submit()
-        band = across, min(rows, down - first), 1
-        first_row = space.gpu.uniform("I", first)
-        space.run(kernel, band, first_row=first_row, **lists.by_tile, **buffers)
+        groups = across, min(rows, down - first), 1
+        band = space.gpu.uniform("II", first, flags)
+        arrays = {"band": band, **lists.by_tile, **buffers, **given}
+        space.run(kernel, groups, groups[1] / down, **arrays)

@@ -195,12 +195,13 @@ class GpuTraining(ResidentTraining):
         for name, words in self._sizes(step).items():
             at[name] = end
             end += words
-        results = space.get("results", 4 * max(RESULT_WORDS, end))
+        results = space.get("results", 4 * max(RESULT_WORDS, end), 4 * (end - at["totals"]))
         length = rasterise.admit(
             space, visible, self._capacity, self.stopped, results, at["totals"]
         )
         lists = rasterise.fill_lists(space, visible, length, self._capacity)
-        image = rasterise.blend(space, lists)
+        planes = step.image.surroundings is not None or step.losses is not None
+        image = rasterise.blend(space, lists, planes=planes)
         target = self.images.get(step.image)
         d_color, d_planes, loss = self._loss(step, target, image)
         sum_blocks(space, loss.sums, loss.rows, 4, results, at["loss"])
@@ -256,6 +257,7 @@ class GpuTraining(ResidentTraining):
     def _make_room(self, totals: Sequence[Totals]) -> None:
         """Give the next steps room by the pairs of the last ones."""
         self._pairs.extend(each.pairs for each in totals)
+        self.gpu.counts.pairs = self._pairs[-1]
         most = max(self._pairs)
         if LEAST_ROOM * most <= self._capacity <= max(MIN_CAPACITY, MOST_ROOM * most):
             return
@@ -297,15 +299,15 @@ class GpuTraining(ResidentTraining):
 
     def _loss(
         self, step: ResidentStep, target: _Image, image: rasterise.Image
-    ) -> tuple[Buffer, Buffer, LossSums]:
-        """The gradients on the colours and on alpha and depth, and the loss."""
+    ) -> tuple[Buffer, Buffer | None, LossSums]:
+        """The gradients on the colours and, if any, on alpha and depth, and the loss."""
         space, pixels = self.space, step.camera.width * step.camera.height
         size = step.camera.width, step.camera.height
         weights = step.ssim_weight, step.l2_weight, step.image.gain
         if step.image.surroundings is None:
             loss = l1_ssim(space, image.color, target.photograph, size, *weights)
-            # Nothing writes to this buffer, which is zero from the start.
-            return loss.gradient, space.get("zeros", 8 * pixels), loss
+            return loss.gradient, None, loss
+        assert image.planes is not None
         composed = space.get("composed image", 12 * pixels)
         around = target.layers, pixels, step.alpha_loss
         compose(
@@ -323,13 +325,14 @@ class GpuTraining(ResidentTraining):
         return d_color, d_planes, loss
 
     def _with_other_losses(
-        self, step: ResidentStep, image: rasterise.Image, d_planes: Buffer
-    ) -> Buffer:
+        self, step: ResidentStep, image: rasterise.Image, d_planes: Buffer | None
+    ) -> Buffer | None:
         """The gradients on alpha and depth (2, H, W) with those of the step's other losses."""
         if step.losses is None:
             return d_planes
-        shape = step.camera.height, step.camera.width
-        both = self.gpu.read(d_planes, np.float32, 2 * shape[0] * shape[1]).reshape(2, *shape)
+        both = np.zeros((2, step.camera.height, step.camera.width), np.float32)
+        if d_planes is not None:
+            both[:] = self.gpu.read(d_planes, np.float32, both.size).reshape(both.shape)
         found = step.losses(_Planes(self.gpu, image))
         for part, gradient in zip(both, found, strict=True):
             if gradient is not None:

@@ -24,9 +24,13 @@ class Workspace:
         # Groups keep their buffers, whose ids are the keys.
         self._groups: dict[tuple[Any, ...], BindGroup] = {}
 
-    def get(self, name: str, size: int) -> Buffer:
-        """The buffer of this name, with at least ``size`` bytes."""
-        self.gpu.counts.use(name, size)
+    def get(self, name: str, size: int, used: int | None = None) -> Buffer:
+        """The buffer of this name, with at least ``size`` bytes.
+
+        Args:
+            used: The bytes that the next kernels use, for the counts; None: all.
+        """
+        self.gpu.counts.use(name, size if used is None else used)
         found = self._buffers.get(name)
         if found is None or found.size < size:
             grown = size if found is None else min(int(GROWTH * size), self.gpu.max_bytes)
@@ -50,12 +54,22 @@ class Workspace:
         self._uniforms[name] = packed, self.gpu.submissions
         return buffer
 
-    def run(self, kernel: str, groups: int | tuple[int, int, int], **buffers: Buffer) -> None:
+    def run(
+        self,
+        kernel: str,
+        groups: int | tuple[int, int, int],
+        share: float = 1.0,
+        **buffers: Buffer,
+    ) -> None:
         """``Gpu.run`` for buffers that are used again in the next step: their bind group is made
-        once, which takes longer than to record a kernel."""
+        once, which takes longer than to record a kernel.
+
+        Args:
+            share: The part of the bytes of the buffers that this dispatch uses, for the counts.
+        """
         key = (kernel, *map(id, buffers.values()))
         if key not in self._groups:
             if len(self._groups) == MAX_GROUPS:
                 self._groups.clear()
             self._groups[key] = self.gpu.bind(kernel, buffers)
-        self.gpu.dispatch(kernel, groups, self._groups[key])
+        self.gpu.dispatch(kernel, groups, self._groups[key], share)

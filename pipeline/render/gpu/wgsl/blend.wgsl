@@ -4,6 +4,7 @@
 #import common
 #import view
 #import record
+#import band
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> records: array<Record>;
@@ -11,12 +12,11 @@
 @group(0) @binding(3) var<storage, read> pairs: array<u32>;        // by tile, front to back
 @group(0) @binding(4) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(5) var<storage, read_write> color: array<f32>;
-// Three images: alpha, depth (sum of weight * z), median depth.
+// Three images, if any: alpha, depth (sum of weight * z), median depth.
 @group(0) @binding(6) var<storage, read_write> planes: array<f32>;
 // The number of the tile's pairs up to the last one that contributes to the pixel.
 @group(0) @binding(7) var<storage, read_write> ends: array<u32>;
-// Long dispatches are divided into bands of rows of tiles: drivers of displays end those of seconds.
-@group(0) @binding(8) var<uniform> first_row: u32;
+@group(0) @binding(8) var<uniform> band: Band;
 
 var<workgroup> batch: array<Record, kThreads>;
 var<workgroup> going: atomic<u32>;  // number of pixels that have not stopped
@@ -25,7 +25,7 @@ var<workgroup> any_going: u32;
 @compute @workgroup_size(kTile, kTile)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let tile = group.xy + vec2(0u, first_row);
+    let tile = group.xy + vec2(0u, band.first_row);
     let position = tile * kTile + inside.xy;
     let pixel = vec2<f32>(position) + 0.5;
     let range = ranges[tile.y * view.tiles.x + tile.x];
@@ -70,9 +70,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
     color[3u * at] = rgb.x;
     color[3u * at + 1u] = rgb.y;
     color[3u * at + 2u] = rgb.z;
-    let pixels = view.size.x * view.size.y;
-    planes[at] = 1.0 - transmittance;
-    planes[pixels + at] = depth;
-    planes[2u * pixels + at] = median;
     ends[at] = end;
+    if ((band.flags & kPlanes) != 0u) {
+        let pixels = view.size.x * view.size.y;
+        planes[at] = 1.0 - transmittance;
+        planes[pixels + at] = depth;
+        planes[2u * pixels + at] = median;
+    }
 }

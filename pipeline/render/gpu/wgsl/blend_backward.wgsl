@@ -9,6 +9,7 @@
 #import common
 #import view
 #import record
+#import band
 #import moments
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -22,8 +23,7 @@
 @group(0) @binding(8) var<storage, read> d_color: array<f32>;
 @group(0) @binding(9) var<storage, read> d_planes: array<f32>;  // of alpha and depth
 @group(0) @binding(10) var<storage, read_write> slots: array<f32>;
-// Long dispatches are divided into bands of rows of tiles: drivers of displays end those of seconds.
-@group(0) @binding(11) var<uniform> first_row: u32;
+@group(0) @binding(11) var<uniform> band: Band;
 
 const kBatch = 8u;
 const kPerGaussian = kThreads / kBatch;  // threads that sum one Gaussian's moments
@@ -39,7 +39,7 @@ var<workgroup> tile_end: u32;
 @compute @workgroup_size(kTile, kTile)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let tile = group.xy + vec2(0u, first_row);
+    let tile = group.xy + vec2(0u, band.first_row);
     let corner = vec2<f32>(tile * kTile) + 0.5;
     let position = tile * kTile + inside.xy;
     let pixel = corner + vec2<f32>(inside.xy);
@@ -51,16 +51,19 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
     var behind = 0.0;  // S: starts as the whole sum
     if (all(position < view.size)) {
         let at = position.y * view.size.x + position.x;
-        let pixels = view.size.x * view.size.y;
         end = ends[at];
         d_rgb = vec3(d_color[3u * at], d_color[3u * at + 1u], d_color[3u * at + 2u]);
-        d_depth = d_planes[pixels + at];
         // The weight of the background is 1 - alpha.
         let under = dot(d_rgb, view.background);
         let rgb = vec3(color[3u * at], color[3u * at + 1u], color[3u * at + 2u]);
-        d_alpha = d_planes[at] - under;
-        behind = dot(rgb, d_rgb) - under + planes[at] * d_planes[at]
-            + planes[pixels + at] * d_depth;
+        d_alpha = -under;
+        behind = dot(rgb, d_rgb) - under;
+        if ((band.flags & kPlanes) != 0u) {
+            let pixels = view.size.x * view.size.y;
+            d_depth = d_planes[pixels + at];
+            d_alpha = d_planes[at] - under;
+            behind += planes[at] * d_planes[at] + planes[pixels + at] * d_depth;
+        }
     }
     d_pixel[local] = vec4(d_rgb, d_depth);
     if (local == 0u) { atomicStore(&last, 0u); }

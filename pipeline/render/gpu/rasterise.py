@@ -304,47 +304,53 @@ def blend(space: Workspace, lists: Lists) -> Image:
     return Image(lists, **arrays)
 
 
-def backward(
-    space: Workspace,
-    image: Image,
-    d_color: Buffer,
-    d_planes: Buffer,
-    rates: AdamRates | None,
-    **more: Buffer,
+def blend_backward(space: Workspace, image: Image, d_color: Buffer, d_planes: Buffer) -> Buffer:
+    """The slots of gradients of all pairs, from the gradients on the colour (H, W, 3) and on alpha
+    and depth (2, H, W)."""
+    slots = space.get("slots of gradients", layout.SLOT_BYTES * image.lists.capacity)
+    _run_in_bands(
+        space, "blend_backward", image.lists, color=image.color, planes=image.planes,
+        ends=image.ends, d_color=d_color, d_planes=d_planes, slots=slots,
+    )  # fmt: skip
+    return slots
+
+
+def project_backward(
+    space: Workspace, lists: Lists, slots: Buffer, rates: AdamRates | None, **more: Buffer
 ) -> Buffer:
-    """The gradients of the parameters (sections of ``layout.GRADIENTS``), from the gradients on the
-    colour (H, W, 3) and on alpha and depth (2, H, W).
+    """The gradients of the parameters (sections of ``layout.GRADIENTS``).
 
     Args:
+        slots: The result of ``blend_backward``.
         rates: The rates of ``ShAdam``, which updates the SH coefficients; None: it does not.
         more: ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH coefficients that are updated, or
-            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients; ``stopped``
-            as of ``admit``.
+            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients.
     """
-    lists, projection = image.lists, image.lists.projection
-    scene = projection.scene
-    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.capacity)
-    _run_in_bands(
-        space, "blend_backward", lists, color=image.color, planes=image.planes, ends=image.ends,
-        d_color=d_color, d_planes=d_planes, slots=slots,
-    )  # fmt: skip
+    scene = lists.projection.scene
     flags = layout.SH_ADAM * (rates is not None) | layout.CAMERA * ("d_camera" in more)
     gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
     space.run(
         "project_backward",
         blocks(scene.count),
-        view=projection.view,
         adam=uniform(space, "Adam of SH", rates or NO_RATES, scene.count, flags=flags),
-        geometry=scene.geometry,
-        sh=scene.sh,
-        records=projection.records,
-        tile_counts=projection.tile_counts,
-        slot_of=lists.slots,
-        slots=slots,
         gradients=gradients,
+        **slots_of_gaussians(lists, slots),
         **more,
     )
     return gradients
+
+
+def slots_of_gaussians(lists: Lists, slots: Buffer) -> dict[str, Buffer]:
+    """The buffers from which gradient.wgsl computes gradients of Gaussians."""
+    projection = lists.projection
+    return {
+        "view": projection.view,
+        "geometry": projection.scene.geometry,
+        "sh": projection.scene.sh,
+        "tile_counts": projection.tile_counts,
+        "slot_of": lists.slots,
+        "slots": slots,
+    }
 
 
 def camera_gradients(total: NDArray[np.float64]) -> CameraGradients:

@@ -81,9 +81,10 @@ fn main(thread: Thread) {
 
     var r: Record;
     r.centre = p.centre;
-    r.uu = sqrt(kHalfLog2E * p.yy / p.det);
-    r.ww = sqrt(kHalfLog2E / p.yy);
-    r.uw = -r.uu * p.xy / p.yy;
+    let factor = factor_of(p);
+    r.uu = factor.x;
+    r.uw = factor.y;
+    r.ww = factor.z;
     r.log2_opacity = log2_opacity;
     r.depth = p.cam.z;
     r.rgb = color.xyz;

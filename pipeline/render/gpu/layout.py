@@ -19,7 +19,6 @@ Tensors = dict[str, Tensor]
 
 TILE = 16  # kTile in constants.h
 RECORD_BYTES = 48  # Record in record.wgsl
-BOX_BYTES = 16  # Box in tile.wgsl
 SLOT_BYTES = 40  # kMoments floats in moments.wgsl
 CAMERA_PARAMETERS = 10  # kCameraParameters in gradient.wgsl
 ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View

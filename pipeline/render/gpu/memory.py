@@ -34,7 +34,7 @@ def training_bytes(size: TrainingSize, cached: int) -> int:
         cached: The maximum bytes of the training images on the device.
     """
     parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
-    per_gaussian = layout.RECORD_BYTES + layout.BOX_BYTES + GAUSSIAN_BYTES
+    per_gaussian = layout.RECORD_BYTES + GAUSSIAN_BYTES
     per_gaussian += PAIRS_PER_GAUSSIAN * PAIR_BYTES
     # Parameters with two moments; those of SH are among the large arrays once.
     moments = 3 * parameters - 12 * size.sh_coefficients

@@ -51,7 +51,7 @@ class Projection:
         scene: The projected Gaussians.
         view: ``View``.
         size: The width and height of the image.
-        records, boxes: ``Record`` and ``Box`` of the visible Gaussians.
+        records: ``Record`` of the visible Gaussians.
         radii: See ``Forward.radii``.
         tile_counts: The number of tiles of each Gaussian.
         depths: The bits of the depths of visible Gaussians, 0 for others, until ``sort_visible``.
@@ -62,7 +62,6 @@ class Projection:
     view: Buffer
     size: tuple[int, int]
     records: Buffer
-    boxes: Buffer
     radii: Buffer
     tile_counts: Buffer
     depths: Buffer
@@ -180,7 +179,6 @@ def project(space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int])
     count = scene.count
     arrays = {
         "records": space.get("records", layout.RECORD_BYTES * count),
-        "boxes": space.get("boxes", layout.BOX_BYTES * count),
         "radii": space.get("radii", 4 * count),
         "tile_counts": space.get("tile counts", 4 * count),
         "depths": space.get("depths", 4 * count),
@@ -265,7 +263,6 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
         before=visible.before,
         tile_counts=p.tile_counts,
         records=p.records,
-        boxes=p.boxes,
         keys=keys,
         gaussian_of=gaussian_of,
         slots=slots,

@@ -36,8 +36,7 @@ PHASES = {
     "blend": ("blend",),
     "loss": ("loss", "sum_rows"),
     "blend backward": ("blend_backward",),
-    "projection backward": ("project_backward",),
-    "Adam, statistics": ("optimise",),
+    "projection backward, Adam": ("update_gaussians",),
 }
 COPIED = 1 << 28  # The number of bytes that the measurement of bandwidth copies.
 
@@ -102,7 +101,7 @@ def measure(scene: Scene, backend: GpuBackend, turns: int) -> GpuResult:
         frames_per_s=1 / frames[0],
         cpu_frames_per_s=1 / frames[1],
         bandwidth=bandwidth(gpu),
-        moments_bandwidth=_sh_bytes(scene) / max(1e-9, profile.seconds["project_backward"] / turns),
+        moments_bandwidth=_sh_bytes(scene) / max(1e-9, profile.seconds["update_gaussians"] / turns),
     )
 
 
@@ -117,12 +116,12 @@ def report(result: GpuResult) -> None:
     total = sum(result.phase_ms.values())
     print(f"\n{result.scene}, on {result.device}, {result.driver}")
     for phase, each in result.phase_ms.items():
-        print(f"{phase:24} {each:9.2f} ms {100 * each / total:5.1f} %")
+        print(f"{phase:26} {each:9.2f} ms {100 * each / total:5.1f} %")
     waits = result.step_ms - total
-    print(f"{'kernels':24} {total:9.2f} ms\n{'a step':24} {result.step_ms:9.2f} ms, ", end="")
+    print(f"{'kernels':26} {total:9.2f} ms\n{'a step':26} {result.step_ms:9.2f} ms, ", end="")
     print(f"{waits:.2f} of them not in kernels; {result.cpu_step_ms:.2f} on the processor")
     print(
-        f"{'frames per second':24} {result.frames_per_s:9.1f}, {result.cpu_frames_per_s:.1f} on "
+        f"{'frames per second':26} {result.frames_per_s:9.1f}, {result.cpu_frames_per_s:.1f} on "
         f"the processor\nmemory: {result.bandwidth / 1e9:.1f} GB/s by copies; projection backward "
         f"moves at least {result.moments_bandwidth / 1e9:.1f}"
     )

@@ -44,14 +44,16 @@ def test_a_step_takes_few_dispatches(counts: Counts) -> None:
     assert counts.submissions <= 2 * STEPS
 
 
-def test_moments_are_read_and_written_once(counts: Counts) -> None:
+def test_parameters_and_moments_are_read_and_written_once(counts: Counts) -> None:
     traffic = counts.traffic
     assert traffic is not None
-    floats = {"first sh": 48, "second sh": 48, "first means": 3, "second opacity_logits": 1,
+    floats = {"sh": 48, "geometry": 11, "first sh": 48, "second sh": 48, "moments": 20,
               "statistics": 2}  # fmt: skip
     for name, width in floats.items():
-        expected = 4 * width * GAUSSIANS * STEPS
-        assert traffic.read[name] == traffic.written[name] == expected, name
+        once = 4 * width * GAUSSIANS * STEPS
+        reads = 2 if name in ("sh", "geometry") else 1  # The projection reads parameters.
+        assert (traffic.read[name], traffic.written[name]) == (reads * once, once), name
+    assert not traffic.read["gradients"] + traffic.written["gradients"]
 
 
 def test_images_are_moved_few_times(counts: Counts) -> None:
@@ -87,8 +89,9 @@ def test_the_bands_of_an_image_count_it_once(
 
 
 def test_uses_of_buffers_are_read_from_the_kernels() -> None:
-    found = kernels.uses("project_backward")
+    found = kernels.uses("update_gaussians")
     assert found["gradients"] == Use(read=False, written=True)
+    assert found["moments"] == found["geometry"] == Use(read=True, written=True)
     assert found["exp_avg"] == found["sh"] == Use(read=True, written=True)
     assert found["slots"] == Use(read=True, written=False)
     forward, backward = kernels.uses("compose.compose"), kernels.uses("compose.backward")

@@ -22,6 +22,8 @@ def adam_step(
     *,
     shared: bool,
     at: int = 0,
+    gradient_at: int = 0,
+    moments_at: int = 0,
     **buffers: Buffer,
 ) -> None:
     """Update a parameter (N, width) by ``Backend.adam_step``.
@@ -29,8 +31,9 @@ def adam_step(
     Args:
         name: The parameter's name, which the workspace's buffers get.
         shared: Each row has one second moment.
-        at: The first element of the parameter and of its gradient in their buffers.
-        buffers: ``parameter``, ``gradient``, ``exp_avg`` and ``exp_avg_sq``.
+        at, gradient_at, moments_at: The first elements of the parameter, of its gradient and of its
+            moments in their buffers.
+        buffers: ``parameter``, ``gradient`` and ``moments``, the first before the second.
     """
     rows, width = shape
     count = rows if shared else rows * width
@@ -38,7 +41,9 @@ def adam_step(
     space.run(
         "adam.rows" if shared else "adam.elements",
         blocks(count),
-        adam=uniform(space, f"Adam of {name}", rates, count, width=width, at=at),
+        adam=uniform(
+            space, f"Adam of {name}", rates, count, width=width, at=(at, gradient_at, moments_at)
+        ),
         rates=space.write_uniform(f"rates of {name}", lr.tobytes()),
         **buffers,
     )
@@ -48,47 +53,47 @@ def frame_adam(space: Workspace, rates: AdamRates, count: int, **buffers: Buffer
     """Update ``count`` means and rotations by ``Backend.frame_adam``.
 
     Args:
-        buffers: ``geometry`` and ``gradients``, whose first sections are means, log scales and
-            quaternions, and the moments ``mean_avg``, ``mean_avg_sq``, ``rotation_avg`` and
-            ``rotation_avg_sq``.
+        buffers: ``geometry``, whose first sections are means, log scales and quaternions,
+            ``gradients`` of means and quaternions, and ``moments``, the first and the second of
+            means and then of rotations.
     """
     adam = uniform(space, "Adam of frames", rates, count)
     space.run("frame_adam", blocks(count), adam=adam, **buffers)
 
 
-def optimise(
+def update_gaussians(
     space: Workspace,
     rates: Mapping[str, AdamRates],
     count: int,
     half_size: tuple[float, float],
-    *,
-    moments: Mapping[str, Buffer],
+    written: Mapping[str, int],
     **buffers: Buffer,
 ) -> None:
-    """Update log scales, opacities, means and rotations by ``Backend.adam_step`` and
-    ``Backend.frame_adam``, and the statistics of density control.
+    """Differentiate the projection, and update SH coefficients, log scales, opacities, means and
+    rotations by ``ShAdam``, ``Backend.adam_step`` and ``Backend.frame_adam``, and the statistics of
+    density control.
 
     Args:
-        rates: The rates of ``log_scales`` and ``opacity_logits``, and of ``frames``, without which
-            means and rotations are not updated. They differ in the learning rates only.
+        rates: The rates of ``sh``, ``log_scales`` and ``opacity_logits``, and of ``frames``,
+            without which means and rotations are not updated. They differ in the learning rates
+            only.
         half_size: Half of the width and height of the image.
-        moments: The moments of a parameter ``name`` are ``first name`` and ``second name``.
-        buffers: ``gradients``, ``geometry``, ``radii``, ``statistics`` and ``stopped``.
+        written: The sections of ``gradients``, see ``layout.written_gradients``.
+        buffers: Those of update_gaussians.wgsl.
     """
-    scales, opacities = rates["log_scales"], rates["opacity_logits"]
-    common, frames = rates.get("frames", scales), "frames" in rates
-    assert len({replace(each, lr=0.0) for each in (scales, opacities, common)}) == 1
-    at, _ = layout.offsets(layout.GRADIENTS, count)["means2d"]
-    names = {"scale": "log_scales", "opacity": "opacity_logits"}
-    names |= {"mean": "means", "rotation": "quats"} if frames else {}
-    options = (layout.FRAMES * frames, at, *half_size, *_corrected(scales), *_corrected(opacities))
+    scales, opacities, sh = (rates[name] for name in ("log_scales", "opacity_logits", "sh"))
+    common = rates.get("frames", scales)
+    assert len({replace(each, lr=0.0) for each in (scales, opacities, sh, common)}) == 1
+    at = layout.offsets(written, count)
+    flags = layout.FRAMES * ("frames" in rates)
+    flags |= layout.CAMERA * ("camera" in written) | layout.COLORS * ("colors" in written)
+    starts = (at.get(name, (0, 0))[0] for name in ("colors", "means", "quats"))
+    corrected = (rate for each in (sh, scales, opacities) for rate in _corrected(each))
     space.run(
-        "optimise",
+        "update_gaussians",
         blocks(count),
         adam=uniform(space, "Adam", common, count),
-        options=space.uniform("options of Adam", "II4f", *options),
-        **{f"{short}_avg": moments[f"first {name}"] for short, name in names.items()},
-        **{f"{short}_avg_sq": moments[f"second {name}"] for short, name in names.items()},
+        options=space.uniform("options of Adam", "4I6f", flags, *starts, *half_size, *corrected),
         **buffers,
     )
 
@@ -100,7 +105,7 @@ def uniform(
     count: int,
     *,
     width: int = 0,
-    at: int = 0,
+    at: tuple[int, int, int] = (0, 0, 0),
     flags: int = 0,
 ) -> Buffer:
     """The buffer of this name with ``Adam`` of adam_rates.wgsl."""
@@ -108,8 +113,8 @@ def uniform(
     lr = _corrected(rates)
     to_root = 1 / math.sqrt(1 - beta2**step)
     return space.uniform(
-        name, "6I10f", count, width, len(lr), at, flags, step, *[*lr, 0.0][:2],
-        beta1, beta2, 1 - beta1, 1 - beta2, rates.eps, to_root, beta1 / math.sqrt(beta2), 0.0,
+        name, "8I9f", count, width, len(lr), *at, flags, step, *[*lr, 0.0][:2],
+        beta1, beta2, 1 - beta1, 1 - beta2, rates.eps, to_root, beta1 / math.sqrt(beta2),
     )  # fmt: skip
 
 

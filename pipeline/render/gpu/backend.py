@@ -36,7 +36,6 @@ from pipeline.render.types import (
 )
 
 NAMES = ("means", "log_scales", "quats", "opacity_logits")
-FRAMES = {name: layout.GEOMETRY[name] for name in ("means", "log_scales", "quats")}
 
 
 @dataclass(frozen=True)
@@ -172,11 +171,12 @@ class GpuBackend(Backend[Projected, Binned]):
         gpu.copy(scene.sh, 0, updated, 0, 4 * sh.numel())
         space = Workspace(gpu)
         projection = replace(projection, scene=replace(scene, sh=updated))
-        gradients = rasterise.backward(
-            space, replace(image, lists=replace(image.lists, projection=projection)),
-            gpu.upload(d_color.numpy()), gpu.upload(d_planes),
-            None if sh_adam is None else sh_adam.rates, **more,
-        )  # fmt: skip
+        slots = rasterise.blend_backward(
+            space, image, gpu.upload(d_color.numpy()), gpu.upload(d_planes)
+        )
+        rates = None if sh_adam is None else sh_adam.rates
+        lists = replace(image.lists, projection=projection)
+        gradients = rasterise.project_backward(space, lists, slots, rates, **more)
         if sh_adam is not None:
             layout.fetch(gpu, updated, sh)
         for name, tensor in tensors.items():
@@ -231,15 +231,18 @@ class GpuBackend(Backend[Projected, Binned]):
         self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:
         checks.check_adam(param, grad, moments, rates)
-        gpu, tensors = self.gpu, {"parameter": param.detach(), **vars(moments)}
-        buffers = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
+        gpu, parameter, both = self.gpu, param.detach(), vars(moments)
+        buffers = {
+            "parameter": gpu.upload(parameter.numpy()),
+            "moments": gpu.upload(layout.join(both.values())),
+        }
         adam.adam_step(
             Workspace(gpu), "a tensor", rates, (len(param), param[:1].numel()),
             shared=moments.exp_avg_sq.shape != param.shape,
             gradient=gpu.upload(grad.detach().numpy()), **buffers,
         )  # fmt: skip
-        for name, tensor in tensors.items():
-            layout.fetch(gpu, buffers[name], tensor)
+        layout.fetch(gpu, buffers["parameter"], parameter)
+        layout.fetch(gpu, buffers["moments"], *both.values())
 
     def frame_adam(
         self,
@@ -255,25 +258,15 @@ class GpuBackend(Backend[Projected, Binned]):
         parameters = means, quats, log_scales
         checks.check_frame_adam(parameters, (d_means, d_quats), moments, rates)
         gpu, count = self.gpu, len(means)
-        of_means, of_rotations = moments.means, moments.rotations
         tensors = {
-            "mean_avg": of_means.exp_avg,
-            "mean_avg_sq": of_means.exp_avg_sq,
-            "rotation_avg": of_rotations.exp_avg,
-            "rotation_avg_sq": of_rotations.exp_avg_sq,
+            "geometry": (means, log_scales, quats),
+            "gradients": (d_means, d_quats),
+            "moments": (*vars(moments.means).values(), *vars(moments.rotations).values()),
         }
-        buffers = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
-        # The gradients of log scales are not read.
-        gradients = {"means": d_means, "log_scales": d_means, "quats": d_quats}
-        geometry = {"means": means, "log_scales": log_scales, "quats": quats}
-        buffers["geometry"] = gpu.upload(layout.join(FRAMES, geometry))
-        buffers["gradients"] = gpu.upload(layout.join(FRAMES, gradients))
+        buffers = {name: gpu.upload(layout.join(each)) for name, each in tensors.items()}
         adam.frame_adam(Workspace(gpu), rates, count, **buffers)
-        found = layout.split(FRAMES, buffers["geometry"], gpu, count)
-        means.detach().copy_(found["means"])
-        quats.detach().copy_(found["quats"])
-        for name, tensor in tensors.items():
-            layout.fetch(gpu, buffers[name], tensor)
+        for name in ("geometry", "moments"):
+            layout.fetch(gpu, buffers[name], *tensors[name])
 
     def _scene(self, parameters: Parameters) -> rasterise.Scene:
         """The parameters on the device. Those of the last call are copied once: usually, a scene is
@@ -281,11 +274,10 @@ class GpuBackend(Backend[Projected, Binned]):
         key = tuple((p.data_ptr(), p._version, p.shape) for p in parameters)
         if self._last is None or self._last[0] != key:
             count, sh = len(parameters[0]), parameters[4]
-            geometry = layout.join(layout.GEOMETRY, dict(zip(NAMES, parameters[:4], strict=True)))
             scene = rasterise.Scene(
                 count,
                 sh.shape[1],
-                self.gpu.upload(geometry, what=f"{count} Gaussians"),
+                self.gpu.upload(layout.join(parameters[:4]), what=f"{count} Gaussians"),
                 self.gpu.upload(sh.numpy(), what="the SH coefficients"),
             )
             # The tensors are kept, so that others cannot get their addresses.

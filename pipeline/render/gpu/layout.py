@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,21 +19,48 @@ Tensors = dict[str, Tensor]
 
 TILE = 16  # kTile in constants.h
 RECORD_BYTES = 48  # Record in record.wgsl
-BOX_BYTES = 16  # Box in tile.wgsl
 SLOT_BYTES = 40  # kMoments floats in moments.wgsl
-CAMERA_PARAMETERS = 10  # kCameraParameters in project_backward.wgsl
+CAMERA_PARAMETERS = 10  # kCameraParameters in gradient.wgsl
 ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
 BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
 FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
 SH_ADAM, CAMERA = 1, 2  # flags of Adam in project_backward.wgsl
 PLANES = 1  # flag of Band in band.wgsl
-FRAMES = 1  # flag of Options in optimise.wgsl
+FRAMES, COLORS = 1, 4  # flags of Options in update_gaussians.wgsl, beside CAMERA
 
 # The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the
 # offsets of the parameters, project_backward.wgsl those of the gradients.
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
 STATISTICS = {"gradient_sum": 1, "seen": 1}
 GRADIENTS = GEOMETRY | {"means2d": 2, "colors": 3}
+# The parameters whose moments are in one array, first and second of each, as update_gaussians.wgsl
+# reads them.
+MOMENTS = ("log_scales", "opacity_logits", "means", "quats")
+
+
+def written_gradients(*, camera: bool, colors: bool, frames: bool) -> dict[str, int]:
+    """The sections of the gradients that a training step writes for other kernels.
+
+    Args:
+        camera, colors: Whether these are read.
+        frames: Whether means and rotations are updated in the local frames, not by their gradients.
+    """
+    found = {"camera": CAMERA_PARAMETERS} if camera else {}
+    found |= {"colors": GRADIENTS["colors"]} if colors else {}
+    return found if frames else found | {name: GEOMETRY[name] for name in ("means", "quats")}
+
+
+def moments(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> Tensors:
+    """The tensors of the array of moments, by the names of its sections, in order."""
+    found = {}
+    for name in MOMENTS:
+        found |= {f"first {name}": first[name], f"second {name}": second[name]}
+    return found
+
+
+def widths(tensors: Mapping[str, Tensor]) -> dict[str, int]:
+    """The sections of an array of tensors (N, ...)."""
+    return {name: math.prod(tensor.shape[1:]) for name, tensor in tensors.items()}
 
 
 def floats(sections: Mapping[str, int]) -> int:
@@ -49,9 +77,9 @@ def offsets(sections: Mapping[str, int], count: int) -> dict[str, tuple[int, int
     return found
 
 
-def join(sections: Mapping[str, int], tensors: Mapping[str, Tensor]) -> NDArray[Any]:
-    """The tensors of the sections, one after another."""
-    return np.concatenate([tensors[name].detach().numpy().reshape(-1) for name in sections])
+def join(tensors: Iterable[Tensor]) -> NDArray[Any]:
+    """The numbers of tensors of one type, one tensor after another."""
+    return np.concatenate([tensor.detach().numpy().reshape(-1) for tensor in tensors])
 
 
 def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> Tensors:
@@ -63,10 +91,12 @@ def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> T
     }
 
 
-def fetch(gpu: Gpu, buffer: Buffer, tensor: Tensor) -> None:
-    """Copy a buffer into a tensor."""
-    found = gpu.read(buffer, tensor.detach().numpy().dtype, tensor.numel())
-    tensor.detach().copy_(torch.from_numpy(found).view(tensor.shape))
+def fetch(gpu: Gpu, buffer: Buffer, *tensors: Tensor) -> None:
+    """Copy a buffer into tensors of one type, which lie in it one after another."""
+    sizes = [tensor.numel() for tensor in tensors]
+    found = torch.from_numpy(gpu.read(buffer, tensors[0].detach().numpy().dtype, sum(sizes)))
+    for tensor, part in zip(tensors, found.split(sizes), strict=True):
+        tensor.detach().copy_(part.view(tensor.shape))
 
 
 def tiles_of(width: int, height: int) -> tuple[int, int]:

@@ -12,13 +12,16 @@ PAIRS_PER_GAUSSIAN = 8
 # pixel (images and their gradients) in the arrays that are not the largest.
 GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 48, 20, 36
 
+# The gradients that steps write at most; most write none of them.
+ALL_GRADIENTS = layout.written_gradients(camera=True, colors=True, frames=False)
+
 
 def large_arrays(size: TrainingSize) -> dict[str, int]:
     """Bytes of the arrays that can exceed the limit of one buffer."""
     count = size.gaussians
     return {
         "SH coefficients": 12 * size.sh_coefficients * count,
-        "gradients": 4 * layout.floats(layout.GRADIENTS) * count,
+        "gradients": 4 * layout.floats(ALL_GRADIENTS) * count,
         "slots of gradients": layout.SLOT_BYTES * PAIRS_PER_GAUSSIAN * count,
         "image": 12 * size.pixels,
     }
@@ -31,7 +34,7 @@ def training_bytes(size: TrainingSize, cached: int) -> int:
         cached: The maximum bytes of the training images on the device.
     """
     parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
-    per_gaussian = layout.RECORD_BYTES + layout.BOX_BYTES + GAUSSIAN_BYTES
+    per_gaussian = layout.RECORD_BYTES + GAUSSIAN_BYTES
     per_gaussian += PAIRS_PER_GAUSSIAN * PAIR_BYTES
     # Parameters with two moments; those of SH are among the large arrays once.
     moments = 3 * parameters - 12 * size.sh_coefficients

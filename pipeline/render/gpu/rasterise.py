@@ -52,7 +52,7 @@ class Projection:
         scene: The projected Gaussians.
         view: ``View``.
         size: The width and height of the image.
-        records, boxes: ``Record`` and ``Box`` of the visible Gaussians.
+        records: ``Record`` of the visible Gaussians.
         radii: See ``Forward.radii``.
         tile_counts: The number of tiles of each Gaussian.
         depths: The bits of the depths of visible Gaussians, 0 for others, until ``sort_visible``.
@@ -63,7 +63,6 @@ class Projection:
     view: Buffer
     size: tuple[int, int]
     records: Buffer
-    boxes: Buffer
     radii: Buffer
     tile_counts: Buffer
     depths: Buffer
@@ -182,7 +181,6 @@ def project(space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int])
     count = scene.count
     arrays = {
         "records": space.get("records", layout.RECORD_BYTES * count),
-        "boxes": space.get("boxes", layout.BOX_BYTES * count),
         "radii": space.get("radii", 4 * count),
         "tile_counts": space.get("tile counts", 4 * count),
         "depths": space.get("depths", 4 * count),
@@ -268,7 +266,6 @@ def fill_lists(space: Workspace, visible: Visible, length: Buffer, capacity: int
         before=visible.before,
         tile_counts=p.tile_counts,
         records=p.records,
-        boxes=p.boxes,
         keys=keys,
         gaussian_of=gaussian_of,
         slots=slots,
@@ -309,26 +306,16 @@ def blend(space: Workspace, lists: Lists, *, planes: bool) -> Image:
     return Image(lists, color, found, ends)
 
 
-def backward(
-    space: Workspace,
-    image: Image,
-    d_color: Buffer,
-    d_planes: Buffer | None,
-    rates: AdamRates | None,
-    **more: Buffer,
+def blend_backward(
+    space: Workspace, image: Image, d_color: Buffer, d_planes: Buffer | None
 ) -> Buffer:
-    """The gradients of the parameters (sections of ``layout.GRADIENTS``), from the gradients on the
-    colour (H, W, 3) and on alpha and depth (2, H, W).
+    """The slots of gradients of all pairs, from the gradients on the colour (H, W, 3) and on alpha
+    and depth (2, H, W).
 
     Args:
         d_planes: None: they are zero. Otherwise, the image needs its planes.
-        rates: The rates of ``ShAdam``, which updates the SH coefficients; None: it does not.
-        more: ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH coefficients that are updated, or
-            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients; ``stopped``
-            as of ``admit``.
     """
-    lists, projection = image.lists, image.lists.projection
-    scene = projection.scene
+    lists = image.lists
     used = space.gpu.counts.listed(lists.capacity)
     slots = space.get(
         "slots of gradients", layout.SLOT_BYTES * lists.capacity, layout.SLOT_BYTES * used
@@ -338,23 +325,45 @@ def backward(
         space, "blend_backward", lists, planes, color=image.color, ends=image.ends,
         d_color=d_color, slots=slots,
     )  # fmt: skip
+    return slots
+
+
+def project_backward(
+    space: Workspace, lists: Lists, slots: Buffer, rates: AdamRates | None, **more: Buffer
+) -> Buffer:
+    """The gradients of the parameters (sections of ``layout.GRADIENTS``).
+
+    Args:
+        slots: The result of ``blend_backward``.
+        rates: The rates of ``ShAdam``, which updates the SH coefficients; None: it does not.
+        more: ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH coefficients that are updated, or
+            ``d_sh``; ``d_camera`` for the Gaussians' parts of the camera's gradients.
+    """
+    scene = lists.projection.scene
     flags = layout.SH_ADAM * (rates is not None) | layout.CAMERA * ("d_camera" in more)
     gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
     space.run(
         "project_backward",
         blocks(scene.count),
-        view=projection.view,
         adam=uniform(space, "Adam of SH", rates or NO_RATES, scene.count, flags=flags),
-        geometry=scene.geometry,
-        sh=scene.sh,
-        records=projection.records,
-        tile_counts=projection.tile_counts,
-        slot_of=lists.slots,
-        slots=slots,
         gradients=gradients,
+        **slots_of_gaussians(lists, slots),
         **more,
     )
     return gradients
+
+
+def slots_of_gaussians(lists: Lists, slots: Buffer) -> dict[str, Buffer]:
+    """The buffers from which gradient.wgsl computes gradients of Gaussians."""
+    projection = lists.projection
+    return {
+        "view": projection.view,
+        "geometry": projection.scene.geometry,
+        "sh": projection.scene.sh,
+        "tile_counts": projection.tile_counts,
+        "slot_of": lists.slots,
+        "slots": slots,
+    }
 
 
 def camera_gradients(total: NDArray[np.float64]) -> CameraGradients:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render.gpu import layout, rasterise
-from pipeline.render.gpu.adam import adam_step, optimise
+from pipeline.render.gpu.adam import adam_step, update_gaussians
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, upload_layers
 from pipeline.render.gpu.memory import PAIRS_PER_GAUSSIAN, memory_line
@@ -33,7 +33,6 @@ from pipeline.render.resident import (
     StepResult,
     TrainingSize,
 )
-from pipeline.render.types import AdamRates
 
 # The bytes of the training images that are kept on the device. Others are copied at every use.
 IMAGE_CACHE = 2 << 30
@@ -124,6 +123,7 @@ class GpuTraining(ResidentTraining):
         self.gpu, self.space, self.images = gpu, Workspace(gpu), _Images(gpu)
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.buffers: dict[str, Buffer] = {}
+        self.moments_at: dict[str, tuple[int, int]] = {}  # The sections of ``moments``.
         self.embedding_size = 0
         self.stopped = gpu.empty(4, what="stopped")
         self._recorded: list[_Recorded] = []
@@ -137,36 +137,27 @@ class GpuTraining(ResidentTraining):
 
     def load(self, optimised: Optimised) -> None:
         self._read_results()
-        parameters, count, before = optimised.parameters, len(optimised.last), self.scene.count
-        sh, geometry = parameters["sh"], layout.join(layout.GEOMETRY, parameters)
-        self.scene = rasterise.Scene(
-            count, sh.shape[1], self._fill("geometry", geometry), self._fill("sh", sh.numpy())
-        )
-        appearance = parameters.get("appearance")
+        count, before = len(optimised.last), self.scene.count
+        arrays = _arrays(optimised)
+        self.buffers = {
+            name: self._fill(name, layout.join(tensors.values()))
+            for name, tensors in arrays.items()
+        }
+        self.moments_at = layout.offsets(layout.widths(arrays["moments"]), count)
+        coefficients = optimised.parameters["sh"].shape[1]
+        geometry, sh = self.buffers["geometry"], self.buffers["sh"]
+        self.scene = rasterise.Scene(count, coefficients, geometry, sh)
         if not self._pairs:
             self._set_capacity(0, PAIRS_PER_GAUSSIAN * count)
         elif count > before:
             self._set_capacity(max(self._pairs), self._capacity * count // max(before, 1))
+        appearance = optimised.parameters.get("appearance")
         self.embedding_size = 0 if appearance is None else appearance.shape[1]
-        self.buffers = {
-            name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
-        }
-        statistics = layout.join(layout.STATISTICS, vars(optimised))
-        self.buffers["statistics"] = self._fill("statistics", statistics)
 
     def store(self, optimised: Optimised) -> None:
         self._read_results()
-        parameters, scene = optimised.parameters, self.scene
-        found = layout.split(layout.GEOMETRY, scene.geometry, self.gpu, scene.count)
-        for name, tensor in found.items():
-            parameters[name].copy_(tensor.view(parameters[name].shape))
-        layout.fetch(self.gpu, scene.sh, parameters["sh"])
-        for name, tensor in _others(optimised).items():
-            layout.fetch(self.gpu, self.buffers[name], tensor)
-        statistics = self.buffers["statistics"]
-        found = layout.split(layout.STATISTICS, statistics, self.gpu, scene.count)
-        optimised.gradient_sum.copy_(found["gradient_sum"][:, 0])
-        optimised.seen.copy_(found["seen"][:, 0])
+        for name, tensors in _arrays(optimised).items():
+            layout.fetch(self.gpu, self.buffers[name], *tensors.values())
 
     def step(self, step: ResidentStep) -> None:
         if self._recorded:
@@ -206,20 +197,18 @@ class GpuTraining(ResidentTraining):
         d_color, d_planes, loss = self._loss(step, target, image)
         sum_blocks(space, loss.sums, loss.rows, 4, results, at["loss"])
         d_planes = self._with_other_losses(step, image, d_planes)
-        more = self._moments("sh") | {"last_step": self.buffers["last"], "stopped": self.stopped}
+        slots = rasterise.blend_backward(space, image, d_color, d_planes)
+        self._update(step, lists, slots)
         if step.camera_gradients:
             width = layout.CAMERA_PARAMETERS
-            more["d_camera"] = space.get("camera gradients", 4 * width * scene.count)
-        rates = step.adam["sh"]
-        gradients = rasterise.backward(space, image, d_color, d_planes, rates, **more)
-        if step.camera_gradients:
-            sum_blocks(space, more["d_camera"], scene.count, width, results, at["camera"])
+            rows = self._gradients(step)  # The camera's are the first section.
+            sum_blocks(space, rows, scene.count, width, results, at["camera"])
         if appearance is not None:
             space.run("appearance.hide", blocks(scene.count), **appearance)
             space.run("appearance.gradient", blocks(scene.count), **appearance)
             rows = appearance["d_weights"]
             sum_blocks(space, rows, scene.count, self.embedding_size, results, at["embedding"])
-        self._optimise(step, projection, gradients)
+        self._update_others(step)
         gpu.submit()
         self._recorded.append(_Recorded(step, loss, at, end))
 
@@ -341,16 +330,12 @@ class GpuTraining(ResidentTraining):
         self.gpu.write(result, both)
         return result
 
-    def _moments(self, name: str) -> dict[str, Buffer]:
-        first, second = self.buffers[f"first {name}"], self.buffers[f"second {name}"]
-        return {"exp_avg": first, "exp_avg_sq": second}
-
     def _appearance(self, step: ResidentStep) -> dict[str, Buffer] | None:
         """The buffers of appearance.wgsl, if colours depend on the photograph."""
         if step.embedding is None:
             return None
         space, scene, size = self.space, self.scene, len(step.embedding)
-        colors_at, _ = layout.offsets(layout.GRADIENTS, scene.count)["colors"]
+        colors_at, _ = layout.offsets(self._sections(step), scene.count)["colors"]
         sizes = scene.count, size, scene.coefficients, colors_at
         weights = np.array(step.embedding, np.float32)
         return {
@@ -359,74 +344,83 @@ class GpuTraining(ResidentTraining):
             "values": self.buffers["appearance"],
             "sh": scene.sh,
             "colours": space.get("colours", 24 * scene.count),
-            "gradients": self._gradients(),
+            "gradients": self._gradients(step),
             "d_values": space.get("gradients of the appearance", 12 * size * scene.count),
             "d_weights": space.get("gradients of the embedding", 4 * size * scene.count),
         }
 
-    def _gradients(self) -> Buffer:
-        return self.space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * self.scene.count)
-
-    def _optimise(
-        self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
-    ) -> None:
-        """Update all parameters but SH, and the statistics."""
-        scene, camera, rates = self.scene, step.camera, step.adam
-        half = 0.5 * camera.width, 0.5 * camera.height
-        optimise(
-            self.space,
-            rates,
-            scene.count,
-            half,
-            gradients=gradients,
-            geometry=scene.geometry,
-            radii=projection.radii,
-            stopped=self.stopped,
-            statistics=self.buffers["statistics"],
-            moments=self.buffers,
+    def _sections(self, step: ResidentStep) -> dict[str, int]:
+        """The sections of ``_gradients``."""
+        return layout.written_gradients(
+            camera=step.camera_gradients,
+            colors=step.embedding is not None,
+            frames="frames" in step.adam,
         )
-        if "appearance" in self.buffers:
+
+    def _gradients(self, step: ResidentStep) -> Buffer:
+        """The buffer of the gradients that other kernels than update_gaussians.wgsl read."""
+        size = 4 * layout.floats(self._sections(step)) * self.scene.count
+        return self.space.get("gradients", size)
+
+    def _update(self, step: ResidentStep, lists: rasterise.Lists, slots: Buffer) -> None:
+        """Update all parameters of Gaussians, but means and rotations that move along the world's
+        axes, and the statistics."""
+        buffers, sections = self.buffers, self._sections(step)
+        gradients = {"gradients": self._gradients(step)} if sections else {}
+        update_gaussians(
+            self.space,
+            step.adam,
+            self.scene.count,
+            (0.5 * step.camera.width, 0.5 * step.camera.height),
+            sections,
+            stopped=self.stopped,
+            radii=lists.projection.radii,
+            exp_avg=buffers["first sh"],
+            exp_avg_sq=buffers["second sh"],
+            last_step=buffers["last"],
+            moments=buffers["moments"],
+            statistics=buffers["statistics"],
+            **rasterise.slots_of_gaussians(lists, slots),
+            **gradients,
+        )
+
+    def _update_others(self, step: ResidentStep) -> None:
+        """Update the parameters that ``_update`` does not."""
+        space, count, rates, buffers = self.space, self.scene.count, step.adam, self.buffers
+        if "appearance" in buffers:
             width = 3 * self.embedding_size
-            gradient = self.space.get("gradients of the appearance", 4 * width * scene.count)
-            shape, values = (scene.count, width), self.buffers["appearance"]
-            self._adam_step("appearance", rates, shape, gradient, values)
+            adam_step(
+                space, "appearance", rates["appearance"], (count, width), shared=False,
+                gradient=space.get("gradients of the appearance", 4 * width * count),
+                parameter=buffers["appearance"], moments=buffers["moments of the appearance"],
+                stopped=self.stopped,
+            )  # fmt: skip
+        at = layout.offsets(layout.GEOMETRY, count)
+        gradients_at = layout.offsets(self._sections(step), count)
         for name in ("means", "quats"):
             if name in rates:
-                at, _ = layout.offsets(layout.GEOMETRY, scene.count)[name]
-                shape = scene.count, layout.GEOMETRY[name]
-                self._adam_step(name, rates, shape, gradients, scene.geometry, at, shared=True)
-
-    def _adam_step(
-        self,
-        name: str,
-        rates: Mapping[str, AdamRates],
-        shape: tuple[int, int],
-        gradient: Buffer,
-        parameter: Buffer,
-        at: int = 0,
-        *,
-        shared: bool = False,
-    ) -> None:
-        adam_step(
-            self.space,
-            name,
-            rates[name],
-            shape,
-            shared=shared,
-            at=at,
-            gradient=gradient,
-            parameter=parameter,
-            stopped=self.stopped,
-            **self._moments(name),
-        )
+                adam_step(
+                    space, name, rates[name], (count, layout.GEOMETRY[name]), shared=True,
+                    at=at[name][0], gradient_at=gradients_at[name][0],
+                    moments_at=self.moments_at[f"first {name}"][0],
+                    gradient=self._gradients(step), parameter=buffers["geometry"],
+                    moments=buffers["moments"], stopped=self.stopped,
+                )  # fmt: skip
 
 
-def _others(optimised: Optimised) -> dict[str, Tensor]:
-    """All tensors but the parameters of the rasterizer and the statistics, by the names of their
-    buffers."""
-    tensors = {f"first {name}": tensor for name, tensor in optimised.first.items()}
-    tensors |= {f"second {name}": tensor for name, tensor in optimised.second.items()}
-    if (appearance := optimised.parameters.get("appearance")) is not None:
-        tensors["appearance"] = appearance
-    tensors["last"] = optimised.last
-    return tensors
+def _arrays(optimised: Optimised) -> dict[str, Mapping[str, Tensor]]:
+    """The tensors that lie one after another in each buffer, by the names of the buffers."""
+    parameters, first, second = optimised.parameters, optimised.first, optimised.second
+    found: dict[str, Mapping[str, Tensor]] = {
+        "geometry": {name: parameters[name] for name in layout.GEOMETRY},
+        "sh": {"sh": parameters["sh"]},
+        "moments": layout.moments(first, second),
+        "first sh": {"sh": first["sh"]},
+        "second sh": {"sh": second["sh"]},
+        "last": {"last": optimised.last},
+        "statistics": {name: vars(optimised)[name] for name in layout.STATISTICS},
+    }
+    if (appearance := parameters.get("appearance")) is not None:
+        moments = {"first": first["appearance"], "second": second["appearance"]}
+        found |= {"appearance": {"": appearance}, "moments of the appearance": moments}
+    return found

@@ -7,19 +7,20 @@
 @group(0) @binding(1) var<storage, read> rates: array<f32>;  // repeated, with the bias correction
 @group(0) @binding(2) var<storage, read> gradient: array<f32>;
 @group(0) @binding(3) var<storage, read_write> parameter: array<f32>;
-@group(0) @binding(4) var<storage, read_write> exp_avg: array<f32>;
-@group(0) @binding(5) var<storage, read_write> exp_avg_sq: array<f32>;
-@group(0) @binding(6) var<uniform> stopped: u32;  // see admit.wgsl
+@group(0) @binding(4) var<storage, read_write> moments: array<f32>;  // second after first
+@group(0) @binding(5) var<uniform> stopped: u32;  // see admit.wgsl
 
 @compute @workgroup_size(kThreads)
 fn elements(thread: Thread) {
     let i = number_of(thread);
     if (i >= adam.count || stopped != 0u) { return; }
-    let g = gradient[adam.at + i];
-    let m = exp_avg[i] * adam.beta1 + g * adam.rest1;
-    let v = exp_avg_sq[i] * adam.beta2 + g * g * adam.rest2;
-    exp_avg[i] = m;
-    exp_avg_sq[i] = v;
+    let g = gradient[adam.gradient_at + i];
+    let first = adam.moments_at + i;
+    let second = first + adam.count;
+    let m = moments[first] * adam.beta1 + g * adam.rest1;
+    let v = moments[second] * adam.beta2 + g * g * adam.rest2;
+    moments[first] = m;
+    moments[second] = v;
     parameter[adam.at + i] -= rates[i % adam.num_rates] * m / (sqrt(v) * adam.to_root + adam.epsilon);
 }
 
@@ -29,16 +30,18 @@ fn rows(thread: Thread) {
     if (row >= adam.count || stopped != 0u) { return; }
     var squares = 0.0;
     for (var k = 0u; k < adam.width; k++) {
-        let g = gradient[adam.at + row * adam.width + k];
+        let g = gradient[adam.gradient_at + row * adam.width + k];
         squares += g * g;
     }
-    let v = exp_avg_sq[row] * adam.beta2 + squares * adam.rest2 / f32(adam.width);
-    exp_avg_sq[row] = v;
+    let second = adam.moments_at + adam.count * adam.width + row;
+    let v = moments[second] * adam.beta2 + squares * adam.rest2 / f32(adam.width);
+    moments[second] = v;
     let far = rates[0] / (sqrt(v) * adam.to_root + adam.epsilon);
     for (var k = 0u; k < adam.width; k++) {
         let at = row * adam.width + k;
-        let m = exp_avg[at] * adam.beta1 + gradient[adam.at + at] * adam.rest1;
-        exp_avg[at] = m;
+        let first = adam.moments_at + at;
+        let m = moments[first] * adam.beta1 + gradient[adam.gradient_at + at] * adam.rest1;
+        moments[first] = m;
         parameter[adam.at + at] -= far * m;
     }
 }

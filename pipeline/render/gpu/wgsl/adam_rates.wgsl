@@ -4,7 +4,9 @@ struct Adam {
     count: u32,      // of the elements, rows or Gaussians
     width: u32,      // elements of a row
     num_rates: u32,
-    at: u32,         // first element of the parameter and of its gradient in their arrays
+    at: u32,         // first elements of the parameter, its gradient and its moments in their arrays
+    gradient_at: u32,
+    moments_at: u32,
     flags: u32,
     step: u32,
     rate0: f32,      // the first two rates
@@ -16,5 +18,4 @@ struct Adam {
     epsilon: f32,
     to_root: f32,    // bias correction of the root of the second moment
     ratio: f32,      // beta1 / sqrt(beta2)
-    unused: f32,
 }

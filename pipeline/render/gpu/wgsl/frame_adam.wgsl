@@ -2,15 +2,21 @@
 #import frames
 
 @group(0) @binding(0) var<uniform> adam: Adam;
-@group(0) @binding(1) var<storage, read> gradients: array<f32>;
-@group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
-@group(0) @binding(3) var<storage, read_write> mean_avg: array<f32>;  // (N, 3), as the others
-@group(0) @binding(4) var<storage, read_write> mean_avg_sq: array<f32>;
-@group(0) @binding(5) var<storage, read_write> rotation_avg: array<f32>;
-@group(0) @binding(6) var<storage, read_write> rotation_avg_sq: array<f32>;
+// Sections of N rows: the parameters of means (3), log scales (3) and quaternions (4), and the
+// gradients of means and quaternions.
+@group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
+@group(0) @binding(2) var<storage, read> gradients: array<f32>;
+@group(0) @binding(3) var<storage, read_write> moments: array<f32>;
 
 @compute @workgroup_size(kThreads)
 fn main(thread: Thread) {
     let i = number_of(thread);
-    if (i < adam.count) { update_frame(i, adam.count); }
+    let n = adam.count;
+    if (i >= n) { return; }
+    let mean = 3u * i;
+    let quat = 3u * n + 4u * i;
+    let d_mean = vec3(gradients[mean], gradients[mean + 1u], gradients[mean + 2u]);
+    let d_quat = vec4(gradients[quat], gradients[quat + 1u], gradients[quat + 2u],
+                      gradients[quat + 3u]);
+    update_frame(i, n, 0u, d_mean, d_quat);
 }

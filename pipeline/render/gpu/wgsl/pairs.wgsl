@@ -17,10 +17,9 @@ struct Size {
 @group(0) @binding(4) var<storage, read> before: array<u32>;  // pairs before each block of ranks
 @group(0) @binding(5) var<storage, read_write> tile_counts: array<u32>;
 @group(0) @binding(6) var<storage, read> records: array<Record>;
-@group(0) @binding(7) var<storage, read> boxes: array<Box>;
-@group(0) @binding(8) var<storage, read_write> keys: array<u32>;  // 1 + tile
-@group(0) @binding(9) var<storage, read_write> gaussian_of: array<u32>;
-@group(0) @binding(10) var<storage, read_write> slots: array<u32>;
+@group(0) @binding(7) var<storage, read_write> keys: array<u32>;  // 1 + tile
+@group(0) @binding(8) var<storage, read_write> gaussian_of: array<u32>;
+@group(0) @binding(9) var<storage, read_write> slots: array<u32>;
 
 @compute @workgroup_size(kThreads)
 fn main(thread: Thread) {
@@ -28,7 +27,7 @@ fn main(thread: Thread) {
     if (rank >= length) { return; }
     let i = gaussians[rank];
     let r = records[i];
-    let box = boxes[i];
+    let box = box_of(r);
     let slot = before[rank / kBlock] + first[rank];
     let end = min(slot + tile_counts[i], size.capacity);
     var next = slot;

@@ -9,11 +9,10 @@
 @group(0) @binding(1) var<storage, read> geometry: array<f32>;
 @group(0) @binding(2) var<storage, read> sh: array<f32>;
 @group(0) @binding(3) var<storage, read_write> records: array<Record>;
-@group(0) @binding(4) var<storage, read_write> boxes: array<Box>;
-@group(0) @binding(5) var<storage, read_write> radii: array<f32>;
-@group(0) @binding(6) var<storage, read_write> tile_counts: array<u32>;
-@group(0) @binding(7) var<storage, read_write> depths: array<u32>;  // 0: not visible
-@group(0) @binding(8) var<storage, read_write> dropped: atomic<u32>;
+@group(0) @binding(4) var<storage, read_write> radii: array<f32>;
+@group(0) @binding(5) var<storage, read_write> tile_counts: array<u32>;
+@group(0) @binding(6) var<storage, read_write> depths: array<u32>;  // 0: not visible
+@group(0) @binding(7) var<storage, read_write> dropped: atomic<u32>;
 #import geometry
 
 // Pixel centres [x, y] of [0, size) in [centre - extent, centre + extent].
@@ -81,22 +80,24 @@ fn main(thread: Thread) {
 
     var r: Record;
     r.centre = p.centre;
-    r.uu = sqrt(kHalfLog2E * p.yy / p.det);
-    r.ww = sqrt(kHalfLog2E / p.yy);
-    r.uw = -r.uu * p.xy / p.yy;
+    let factor = factor_of(p);
+    r.uu = factor.x;
+    r.uw = factor.y;
+    r.ww = factor.z;
     r.log2_opacity = log2_opacity;
     r.depth = p.cam.z;
     r.rgb = color.xyz;
-    records[i] = r;
     // With a tolerance for the rounding of the test of tiles.
     let wide = pixel_range(p.centre.x, extent.x + kBoxSlack, view.size.x);
     let high = pixel_range(p.centre.y, extent.y + kBoxSlack, view.size.y);
-    let box = Box(u32(wide.x) / kTile, u32(high.x) / kTile, u32(wide.y) / kTile,
-                  u32(high.y) / kTile);
-    boxes[i] = box;
+    let first = vec2(u32(wide.x), u32(high.x)) / kTile;
+    let last = vec2(u32(wide.y), u32(high.y)) / kTile;
+    r.first_tile = packed(first);
+    r.last_tile = packed(last);
+    records[i] = r;
     var count = 0u;
-    for (var y = box.top; y <= box.bottom; y++) {
-        for (var x = box.left; x <= box.right; x++) {
+    for (var y = first.y; y <= last.y; y++) {
+        for (var x = first.x; x <= last.x; x++) {
             count += u32(overlaps(r, vec2(x, y)));
         }
     }

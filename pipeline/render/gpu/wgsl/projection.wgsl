@@ -103,3 +103,9 @@ fn project(in: Inputs, view: View) -> Projected {
     }
     return p;
 }
+
+// The Cholesky factor (uu, uw, ww) of log2(e)/2 times the inverse covariance, see record.wgsl.
+fn factor_of(p: Projected) -> vec3<f32> {
+    let uu = sqrt(kHalfLog2E * p.yy / p.det);
+    return vec3(uu, -uu * p.xy / p.yy, sqrt(kHalfLog2E / p.yy));
+}

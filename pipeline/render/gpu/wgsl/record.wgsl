@@ -12,9 +12,9 @@ struct Record {
     ww: f32,
     log2_opacity: f32,
     depth: f32,
-    unused: f32,
+    first_tile: u32,  // of its bounding box, see `box_of` in tile.wgsl
     rgb: vec3<f32>,
-    unused2: f32,
+    last_tile: u32,
 }
 
 // u and w at a pixel.

@@ -8,6 +8,16 @@ struct Box {
     bottom: u32,
 }
 
+// Records hold a tile as its column and, from bit kRowBit on, its row: images are less than 2^20
+// pixels wide and high.
+const kRowBit = 16u;
+fn packed(tile: vec2<u32>) -> u32 { return tile.x | (tile.y << kRowBit); }
+fn box_of(r: Record) -> Box {
+    let mask = (1u << kRowBit) - 1u;
+    return Box(r.first_tile & mask, r.first_tile >> kRowBit, r.last_tile & mask,
+               r.last_tile >> kRowBit);
+}
+
 // Tolerances of the bounding box, pixels, and of the test of a tile, in log2(alpha): neither must
 // exclude a Gaussian that the blend kernel would draw.
 const kBoxSlack = 0.01;

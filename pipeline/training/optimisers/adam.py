@@ -155,11 +155,8 @@ class Adam:
 
     def select(self, rows: Tensor, fresh: Tensor, threads: int = 1) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""
-        zeroed = torch.nonzero(fresh)[:, 0]
-        self.first = take_rows(self.first, rows, threads)
-        self.second = take_rows(self.second, rows, threads)
-        for tensor in (*self.first.values(), *self.second.values()):
-            tensor.index_fill_(0, zeroed, 0.0)
+        self.first = take_rows(self.first, rows, threads, fresh)
+        self.second = take_rows(self.second, rows, threads, fresh)
         self.last = self.last[rows]
 
     @property

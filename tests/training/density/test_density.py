@@ -29,7 +29,7 @@ from pipeline.training.density.growth import (
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
-from pipeline.training.density.strategy import highest, rotations
+from pipeline.training.density.strategy import Changes, Refinement, highest, rotations
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
 
@@ -111,6 +111,33 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
     if len(result):
         survivors = int((adam.first["opacity_logits"] > 0).sum())
         assert survivors == count - changes.pruned - changes.split
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 40), st.integers(0, 2**31))
+def test_a_selection_of_a_refinement_copies_the_selected_rows(count: int, seed: int) -> None:
+    """In any order and without some of them, changed rows included."""
+    draws = torch.Generator().manual_seed(seed)
+    found = []
+    which = torch.randperm(count, generator=draws)[: int(torch.randint(0, count + 1, (1,)))]
+    changed = torch.nonzero(torch.rand(count, generator=draws) < 0.5)[:, 0]
+    refinement = Refinement(
+        rows=torch.randint(0, 10, (count,), generator=draws),
+        fresh=torch.rand(count, generator=draws) < 0.5,
+        changed=changed,
+        values={"means": torch.rand(len(changed), 3, generator=draws)},
+        changes=Changes(),
+    )
+    for before in (True, False):
+        gaussians, adam = marked(10)
+        step = step_of(strategy(10), gaussians, adam)
+        if before:
+            result = refinement.select(which).copy(step)
+        else:
+            result = refinement.copy(step).select(which)
+            adam.select(which, torch.zeros(len(which), dtype=torch.bool))
+        found.append([*result.tensors().values(), *adam.first.values(), *adam.second.values()])
+    assert all(map(torch.equal, *found))
 
 
 def test_the_budget_goes_to_the_largest_gradients() -> None:

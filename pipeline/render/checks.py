@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -28,16 +29,16 @@ def checked(name: str, value: Tensor, shape: tuple[int | None, ...]) -> Tensor:
     Raises:
         ValueError: not float32 on the CPU, or not of this shape (None: any size).
     """
-    fits = value.dim() == len(shape) and all(
-        expected is None or expected == size
-        for expected, size in zip(shape, value.shape, strict=True)
+    found = value.shape
+    fits = len(found) == len(shape) and all(
+        [wanted is None or wanted == size for wanted, size in zip(shape, found, strict=True)]
     )
-    if value.dtype != torch.float32 or value.device.type != "cpu" or not fits:
+    if value.dtype != torch.float32 or not value.is_cpu or not fits:
         raise ValueError(
             f"{name}: expected float32 {tuple('any' if s is None else s for s in shape)} on the "
             f"CPU, found {value.dtype} {tuple(value.shape)} on {value.device}"
         )
-    return value.detach().contiguous()
+    return (value.detach() if value.requires_grad else value).contiguous()
 
 
 def parameters(
@@ -63,11 +64,11 @@ def parameters(
 
 def check_camera(camera: RasterCamera, near: float) -> None:
     """Raise ValueError if the camera is invalid."""
-    pose = camera.world_to_camera.detach()
+    pose = camera.world_to_camera
     if pose.shape != (4, 4):
         raise ValueError(f"world_to_camera: expected (4, 4), found {tuple(pose.shape)}")
-    values = camera.fx, camera.fy, camera.cx, camera.cy, near
-    if not all(map(math.isfinite, values)) or not bool(pose[:3].isfinite().all()):
+    values = [camera.fx, camera.fy, camera.cx, camera.cy, near, *chain(*pose.tolist()[:3])]
+    if not all(map(math.isfinite, values)):
         raise ValueError("camera: every value must be finite")
     if not (camera.fx > 0 and camera.fy > 0):
         raise ValueError(f"camera: focal lengths must be positive, found {camera.fx}, {camera.fy}")
@@ -171,13 +172,12 @@ def check_frame_adam(
     threes = [means, log_scales, d_means, *vars(moments.means).values()]
     threes += vars(moments.rotations).values()
     for width, tensors in ((3, threes), (4, [quats, d_quats])):
+        shape = (means.shape[0], width)
         for tensor in tensors:
             if tensor.dtype != torch.float32 or not tensor.is_contiguous():
                 raise ValueError("frame_adam: tensors must be float32 and contiguous")
-            if tensor.shape != (len(means), width):
-                raise ValueError(
-                    f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
-                )
+            if tensor.shape != shape:
+                raise ValueError(f"frame_adam: expected {shape}, found {tuple(tensor.shape)}")
     _check_rates("frame_adam", rates, count=2)
 
 

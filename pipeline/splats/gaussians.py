@@ -43,7 +43,7 @@ class Gaussians:
     appearance: Tensor | None = None
 
     def __len__(self) -> int:
-        return len(self.means)
+        return self.means.shape[0]
 
     def __repr__(self) -> str:
         return f"Gaussians({len(self):,} of SH degree {self.sh_degree})"

@@ -3,9 +3,12 @@ while it trains, since its sums depend on the number of threads."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
+
+from pipeline.runtime.memory import huge_pages
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,15 +30,33 @@ def for_ranges(count: int, threads: int, work: Callable[[slice], None]) -> None:
             pass
 
 
-def take_rows(tensors: Mapping[str, Tensor], rows: Tensor, threads: int) -> dict[str, Tensor]:
-    """``tensor[rows]`` of each tensor, contiguous, of int64 indices (M,)."""
+def take_rows(
+    tensors: Mapping[str, Tensor], rows: Tensor, threads: int, zeroed: Tensor | None = None
+) -> dict[str, Tensor]:
+    """``tensor[rows]`` of each tensor, contiguous, of int64 indices (M,); 0 in the rows of the
+    result that ``zeroed`` (M,) bool contains."""
     import torch
 
-    taken = {k: v.new_empty(len(rows), *v.shape[1:]) for k, v in tensors.items()}
+    taken = {name: _new_rows(tensor, len(rows)) for name, tensor in tensors.items()}
 
     def take(part: slice) -> None:
+        empty = None if zeroed is None else torch.nonzero(zeroed[part])[:, 0]
         for name, tensor in tensors.items():
-            torch.index_select(tensor, 0, rows[part], out=taken[name][part])
+            to = taken[name][part]
+            torch.index_select(tensor, 0, rows[part], out=to)
+            if empty is not None:
+                to.index_fill_(0, empty, 0.0)
 
     for_ranges(len(rows), threads, take)
     return taken
+
+
+def _new_rows(tensor: Tensor, count: int) -> Tensor:
+    """(count, ...) values like a row of ``tensor``, not initialised."""
+    import torch
+
+    shape = (count, *tensor.shape[1:])
+    pages = huge_pages(math.prod(shape) * tensor.element_size())
+    if pages is None:
+        return tensor.new_empty(shape)
+    return torch.frombuffer(pages, dtype=tensor.dtype).view(shape)

@@ -27,6 +27,20 @@ def test_taken_rows_are_those_of_an_index(threads: int) -> None:
     assert [len(t) for t in take_rows(tensors, rows[:0], threads).values()] == [0, 0, 0]
 
 
+@pytest.mark.parametrize("threads", [1, 16])
+def test_rows_are_zeroed_in_the_result(threads: int) -> None:
+    """In arrays of huge pages, too."""
+    draws = torch.Generator().manual_seed(0)
+    tensors = {"small": torch.rand(1000, generator=draws), "large": torch.rand(1000, 40)}
+    rows = torch.randint(0, 1000, (COUNT,), generator=draws)
+    zeroed = torch.rand(COUNT, generator=draws) < 0.3
+    taken = take_rows(tensors, rows, threads, zeroed)
+    for name, tensor in tensors.items():
+        expected = tensor[rows]
+        expected[zeroed] = 0.0
+        assert torch.equal(taken[name], expected)
+
+
 @pytest.mark.parametrize("threads", [2, 16, 64])
 def test_the_order_in_space_does_not_depend_on_the_number_of_threads(threads: int) -> None:
     means = np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -83,21 +84,25 @@ def _threads(threads: int) -> int:
 def _pack_view(camera: RasterCamera, options: RasterOptions) -> Tensor:
     """(29,) float64: fx fy cx cy, the rotation by rows, the translation, the near plane, the bounds
     of u and v in the Jacobian, width, height, the SH degree, two flags and the background."""
-    pose = camera.world_to_camera.detach().double()
-    head = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    rows = camera.world_to_camera.tolist()[:3]
+    rotation = (value for row in rows for value in row[:3])
     flags = options.antialias, options.clamp_color_gradient
     size = camera.width, camera.height
     background = options.background or (0.0, 0.0, 0.0)
-    tail = options.near, *camera.slopes, *size, options.sh_degree, *flags, *background
-    return torch.cat(
-        [head, pose[:3, :3].reshape(-1), pose[:3, 3], torch.tensor(tail, dtype=torch.float64)]
+    return _doubles(
+        *(camera.fx, camera.fy, camera.cx, camera.cy, *rotation, *(row[3] for row in rows)),
+        *(options.near, *camera.slopes, *size, options.sh_degree, *flags, *background),
     )
 
 
 def _pack_adam(rates: AdamRates) -> Tensor:
     """Float64: the step, beta1, beta2, epsilon and the learning rates."""
-    values = rates.step, rates.beta1, rates.beta2, rates.eps, *rates.rates
-    return torch.tensor(values, dtype=torch.float64)
+    return _doubles(rates.step, rates.beta1, rates.beta2, rates.eps, *rates.rates)
+
+
+def _doubles(*values: float) -> Tensor:
+    """A float64 tensor. ``torch.tensor`` takes three times as long, in each of a step's calls."""
+    return torch.frombuffer(array("d", values), dtype=torch.float64)
 
 
 class CpuBackend(Backend[Projected, Binned]):

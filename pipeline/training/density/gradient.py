@@ -18,14 +18,14 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
 from pipeline.training.density.growth import (
     GradientStatistics,
-    halve_along_longest_axis,
+    along_longest_axis,
     limit_opacity,
     longest_scale,
     multiply,
 )
 from pipeline.training.density.strategy import (
-    Changes,
     DensityStep,
+    Refinement,
     Strategy,
     highest,
     not_finite,
@@ -82,7 +82,7 @@ class GradientDensity(Strategy):
     def start(self, count: int) -> None:
         self.observed.start(count)
 
-    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+    def refine(self, step: DensityStep) -> Refinement:
         """Prune, then split."""
         kept = ~self._useless(step)
         split = torch.zeros_like(kept)
@@ -92,11 +92,10 @@ class GradientDensity(Strategy):
             kept = kept & ~self._recycled(step, kept, gradient, candidates)
             # Each split adds one Gaussian.
             split = highest(gradient, candidates & kept, max(0, step.budget - int(kept.sum())))
-        result = multiply(step, kept, cloned=torch.zeros_like(kept), split=split)
-        if result.changes.split:
-            halve_along_longest_axis(result.gaussians, result.halves)
-        self.start(len(result.gaussians))
-        return result.gaussians, result.changes
+        none = torch.zeros_like(kept)
+        refinement = multiply(step, kept, cloned=none, split=split, halved=along_longest_axis)
+        self.start(len(refinement.rows))
+        return refinement
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
         limit_opacity(gaussians, adam, unlimited=self._sky(gaussians, adam))

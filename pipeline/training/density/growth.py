@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density.strategy import Changes, DensityStep, rotations
+from pipeline.training.density.strategy import (
+    Changes,
+    DensityStep,
+    Refinement,
+    rotations,
+)
 from pipeline.training.optimisers.adam import Adam
 
 # A sampled split divides the scales by 0.8 N with N = 2 (3DGS).
@@ -52,60 +58,62 @@ class GradientStatistics:
         self.seen = torch.from_numpy(arrays["seen"])
 
 
-@dataclass(frozen=True)
-class Multiplied:
-    """The Gaussians after ``multiply``.
-
-    Attributes:
-        gaussians: First those that stayed, then the clones, then the halves of the split ones.
-        halves: The rows of the halves (2 M): the first ones of M Gaussians, then the second ones.
-            They are still equal to the Gaussian that was split.
-    """
-
-    gaussians: Gaussians
-    halves: slice
-    changes: Changes
+Halving = Callable[[Gaussians], Mapping[str, Tensor]]
+"""Returns the arrays that change by name, for 2 M Gaussians: M and their copies."""
 
 
-def multiply(step: DensityStep, kept: Tensor, cloned: Tensor, split: Tensor) -> Multiplied:
+def multiply(
+    step: DensityStep, kept: Tensor, cloned: Tensor, split: Tensor, halved: Halving
+) -> Refinement:
     """Remove all but ``kept``, and add a copy of each row of ``cloned`` and ``split``, (N,) bool
-    masks of different rows. Copies have no moments, nor have the rows that are split."""
+    masks of different rows. Copies have no moments, nor have the rows that are split.
+
+    Args:
+        halved: Gives the rows that are split, and their copies, other values.
+
+    Returns:
+        First the Gaussians that stay, then the clones, then the first halves of those that are
+        split, then the second ones.
+    """
     changes = Changes(pruned=len(kept) - int(kept.sum()))
     clones, halves = torch.nonzero(cloned)[:, 0], torch.nonzero(split)[:, 0]
     stay = torch.nonzero(kept & ~split)[:, 0]
     changes.cloned, changes.split = len(clones), len(halves)
-    rows = torch.cat([stay, clones, halves, halves])
-    step.adam.select(rows, torch.arange(len(rows)) >= len(stay), step.threads)
-    return Multiplied(
-        step.gaussians.select(rows, step.threads),
-        slice(len(stay) + len(clones), len(rows)),
-        changes,
-    )
+    both = torch.cat([halves, halves])
+    rows = torch.cat([stay, clones, both])
+    number = torch.arange(len(rows))
+    values = halved(step.gaussians.select(both, step.threads)) if changes.split else {}
+    changed = number[len(rows) - len(both) :]
+    return Refinement(rows, number >= len(stay), changed, values, changes)
 
 
-def halve_along_longest_axis(gaussians: Gaussians, rows: slice) -> None:
-    """Move and shrink ``rows`` (2 M), M Gaussians and their copies, in place: each pair lies side
-    by side along the longest axis."""
-    log_scales = gaussians.log_scales[rows]
+def along_longest_axis(halves: Gaussians) -> dict[str, Tensor]:
+    """A ``Halving``: each pair lies side by side along the longest axis, and is smaller and more
+    transparent."""
+    log_scales = halves.log_scales
     each, longest = torch.arange(len(log_scales)), log_scales.argmax(1)
-    axis = rotations(gaussians.quats[rows])[each, :, longest]
+    axis = rotations(halves.quats)[each, :, longest]
     far = LONG_OFFSET * log_scales[each, longest].exp()
     far[len(far) // 2 :] *= -1
-    gaussians.means[rows] += far[:, None] * axis
-    log_scales = log_scales + math.log(OTHER_AXES)
-    log_scales[each, longest] += math.log(LONG_AXIS / OTHER_AXES)
-    gaussians.log_scales[rows] = log_scales
-    opacity = HALVES_OPACITY * torch.sigmoid(gaussians.opacity_logits[rows])
-    gaussians.opacity_logits[rows] = torch.logit(opacity)
+    smaller = log_scales + math.log(OTHER_AXES)
+    smaller[each, longest] += math.log(LONG_AXIS / OTHER_AXES)
+    opacity = HALVES_OPACITY * torch.sigmoid(halves.opacity_logits)
+    return {
+        "means": halves.means + far[:, None] * axis,
+        "log_scales": smaller,
+        "opacity_logits": torch.logit(opacity),
+    }
 
 
-def sample_halves(gaussians: Gaussians, rows: slice, rng: np.random.Generator) -> None:
-    """Move ``rows`` to positions drawn from each Gaussian, and shrink them, in place (3DGS)."""
-    scales = gaussians.log_scales[rows].exp()
+def sampled(halves: Gaussians, rng: np.random.Generator) -> dict[str, Tensor]:
+    """A ``Halving``: positions are drawn from each Gaussian, and scales are smaller (3DGS)."""
+    scales = halves.log_scales.exp()
     noise = torch.from_numpy(rng.standard_normal(scales.shape, np.float32))
-    axes = rotations(gaussians.quats[rows])
-    gaussians.means[rows] += torch.einsum("nij,nj->ni", axes, scales * noise)
-    gaussians.log_scales[rows] -= math.log(SPLIT_SHRINK)
+    offset = torch.einsum("nij,nj->ni", rotations(halves.quats), scales * noise)
+    return {
+        "means": halves.means + offset,
+        "log_scales": halves.log_scales - math.log(SPLIT_SHRINK),
+    }
 
 
 def longest_scale(gaussians: Gaussians) -> Tensor:

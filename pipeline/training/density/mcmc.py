@@ -20,6 +20,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.strategy import (
     Changes,
     DensityStep,
+    Refinement,
     Strategy,
     Update,
     not_finite,
@@ -96,7 +97,7 @@ class McmcDensity(Strategy):
         size = NOISE * MEANS_LEARNING_RATE * rate / self.scale
         gaussians.means[moved] += noise * (share * size)[:, None]
 
-    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+    def refine(self, step: DensityStep) -> Refinement:
         """Relocate transparent Gaussians onto others, drawn by opacity, and grow; without
         densification, remove them. Large Gaussians are left to the regulariser."""
         gaussians, adam = step.gaussians, step.adam
@@ -107,28 +108,28 @@ class McmcDensity(Strategy):
         opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double()
         weights = opacity.masked_fill(adam.frozen[alive], 0.0).numpy()
         if not self.densifies_after(step.steps) or not weights.any():
-            adam.select(alive, torch.zeros(len(alive), dtype=torch.bool), step.threads)
-            return gaussians.select(alive, step.threads), Changes(pruned=dead)
+            fresh = torch.zeros(len(alive), dtype=torch.bool)
+            return Refinement(alive, fresh, torch.nonzero(fresh)[:, 0], {}, Changes(pruned=dead))
         grown = min(step.budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
         added = max(0, grown - len(gaussians))
         chosen = step.rng.choice(len(alive), size=dead + added, p=weights / weights.sum())
         copies = torch.from_numpy(np.bincount(chosen, minlength=len(alive)))
         sources = alive[torch.from_numpy(np.sort(chosen))]
-        shared = gaussians.clone()
-        touched = copies > 0
-        rows = alive[touched]
+        shared = torch.nonzero(copies)[:, 0]
         logits, shrink = share_out(
-            gaussians.opacity_logits[rows], copies[touched] + 1, self.options.prune_opacity
+            gaussians.opacity_logits[alive[shared]], copies[shared] + 1, self.options.prune_opacity
         )
-        shared.opacity_logits[rows] = logits
-        shared.log_scales[rows] += shrink[:, None]
+        log_scales = gaussians.log_scales[alive[shared]] + shrink[:, None]
+        rows = torch.cat([alive, sources])
+        # (N,) int64, the place of each row in ``shared``, or -1.
+        place = torch.full((len(gaussians),), -1)
+        place[alive[shared]] = torch.arange(len(shared))
         # The moments of relocated-onto Gaussians belong to the old opacity and scale.
-        for moments in (adam.first, adam.second):
-            for tensor in moments.values():
-                tensor[rows] = 0.0
-        order = torch.cat([alive, sources])
-        adam.select(order, torch.arange(len(order)) >= len(alive), step.threads)
-        return shared.select(order, step.threads), Changes(cloned=added, relocated=dead)
+        fresh = place[rows] >= 0
+        changed = torch.nonzero(fresh)[:, 0]
+        which = place[rows[changed]]
+        values = {"opacity_logits": logits[which], "log_scales": log_scales[which]}
+        return Refinement(rows, fresh, changed, values, Changes(cloned=added, relocated=dead))
 
 
 def share_out(logits: Tensor, parts: Tensor, min_opacity: float) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ cleared before it, and the extra opacity reset with a white background.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,11 +22,11 @@ from pipeline.training.density.growth import (
     limit_opacity,
     longest_scale,
     multiply,
-    sample_halves,
+    sampled,
 )
 from pipeline.training.density.strategy import (
-    Changes,
     DensityStep,
+    Refinement,
     Strategy,
     highest,
     not_finite,
@@ -83,7 +84,7 @@ class OriginalDensity(Strategy):
     def start(self, count: int) -> None:
         self.observed.start(count)
 
-    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+    def refine(self, step: DensityStep) -> Refinement:
         """Split and clone, then prune."""
         every = torch.ones(len(step.gaussians), dtype=torch.bool)
         grow = torch.zeros_like(every)
@@ -92,18 +93,24 @@ class OriginalDensity(Strategy):
             room = max(0, step.budget - len(step.gaussians))
             grow = highest(gradient, gradient >= GRADIENT_THRESHOLD, room)
         large = longest_scale(step.gaussians) > PERCENT_DENSE * self.extent
-        result = multiply(step, every, cloned=grow & ~large, split=grow & large)
-        gaussians, changes = result.gaussians, result.changes
-        if changes.split:
-            sample_halves(gaussians, result.halves, step.rng)
-        useless = torch.sigmoid(gaussians.opacity_logits) < MIN_OPACITY
+        grown = multiply(
+            step,
+            every,
+            cloned=grow & ~large,
+            split=grow & large,
+            halved=partial(sampled, rng=step.rng),
+        )
+        gaussians, rows = step.gaussians, grown.rows
+        useless = torch.sigmoid(gaussians.opacity_logits[rows]) < MIN_OPACITY
+        useless |= not_finite(gaussians, step.threads)[rows]
+        for values in grown.values.values():
+            useless[grown.changed] |= ~torch.isfinite(values).all(1)
         if any(map(self.prunes_large_after, step.steps)):
-            useless |= longest_scale(gaussians) > MAX_SCALE * self.extent
-        alive = torch.nonzero(~(useless | not_finite(gaussians, step.threads)))[:, 0]
-        changes.pruned = len(gaussians) - len(alive)
-        step.adam.select(alive, torch.zeros(len(alive), dtype=torch.bool), step.threads)
-        self.start(len(alive))
-        return gaussians.select(alive, step.threads), changes
+            log_scales = grown.array("log_scales", gaussians, step.threads)
+            useless |= log_scales.amax(1).exp() > MAX_SCALE * self.extent
+        grown.changes.pruned = int(useless.sum())
+        self.start(len(rows) - grown.changes.pruned)
+        return grown.select(torch.nonzero(~useless)[:, 0])
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
         limit_opacity(gaussians, adam)

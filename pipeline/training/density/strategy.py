@@ -7,7 +7,9 @@ parameters, if ``is_due``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,8 @@ from torch import Tensor
 
 from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.rows import for_ranges
+from pipeline.splats.morton import morton_order
+from pipeline.splats.rows import for_ranges, take_rows
 from pipeline.training.density.timeline import Timeline
 from pipeline.training.optimisers.adam import Adam
 
@@ -67,6 +70,54 @@ class DensityStep:
     budget: int = 1_000_000_000
     prune: bool = False
     threads: int = 1
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The set of Gaussians that replaces another one: copies of its rows.
+
+    Attributes:
+        rows: (M,) int64, the row that each Gaussian is copied from.
+        fresh: (M,) bool, the Gaussians without moments.
+        changed: (K,) int64, the Gaussians that are not copies in all arrays.
+        values: Their values, (K, ...), by the names of the arrays that are not copied.
+        changes: What was changed.
+    """
+
+    rows: Tensor
+    fresh: Tensor
+    changed: Tensor
+    values: Mapping[str, Tensor]
+    changes: Changes
+
+    def array(self, name: str, gaussians: Gaussians, threads: int) -> Tensor:
+        """An array of the new set."""
+        array = take_rows({name: gaussians.tensors()[name]}, self.rows, threads)[name]
+        if name in self.values:
+            array[self.changed] = self.values[name]
+        return array
+
+    def select(self, which: Tensor) -> Refinement:
+        """The same set reduced to, or sorted by, int64 indices."""
+        places = torch.full_like(self.rows, -1)
+        places[which] = torch.arange(len(which))
+        changed = places[self.changed]
+        kept = changed >= 0
+        return replace(
+            self,
+            rows=self.rows[which],
+            fresh=self.fresh[which],
+            changed=changed[kept],
+            values={name: values[kept] for name, values in self.values.items()},
+        )
+
+    def copy(self, step: DensityStep) -> Gaussians:
+        """The Gaussians of the new set; the moments become theirs."""
+        step.adam.select(self.rows, self.fresh, step.threads)
+        gaussians = step.gaussians.select(self.rows, step.threads)
+        for name, values in self.values.items():
+            gaussians.tensors()[name][self.changed] = values
+        return gaussians
 
 
 @dataclass(frozen=True)
@@ -124,7 +175,11 @@ class Strategy:
         """The hook after an optimiser step: noise, densification, pruning and opacity resets."""
         gaussians, changes = step.gaussians, None
         if step.prune or self.refines_after(step.steps):
-            gaussians, changes = self.refine(step)
+            refinement = self.refine(step)
+            # Neighbours in space become neighbours in memory, and the rasterizer skips invisible
+            # ones in blocks.
+            order = morton_order(refinement.array("means", gaussians, step.threads), step.threads)
+            gaussians, changes = refinement.select(order).copy(step), refinement.changes
         reset = any(map(self.resets_opacity_after, step.steps))
         if reset:
             self.reset_opacity(gaussians, step.adam)
@@ -134,12 +189,12 @@ class Strategy:
         """Forget all observations; ``count`` Gaussians are observed from here on."""
         raise NotImplementedError
 
-    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+    def refine(self, step: DensityStep) -> Refinement:
         """Remove useless Gaussians and, if the timeline says so, add new ones. Statistics start
-        anew.
+        anew: they are those of the returned set, in any order.
 
         Returns:
-            At most ``step.budget`` Gaussians, or at most as many as before, and what was changed.
+            At most ``step.budget`` Gaussians, or at most as many as before.
         """
         raise NotImplementedError
 
@@ -161,7 +216,9 @@ def not_finite(gaussians: Gaussians, threads: int = 1) -> Tensor:
     def find(rows: slice) -> None:
         for tensor in gaussians.tensors().values():
             part = tensor[rows]
-            bad[rows] |= ~torch.isfinite(part).reshape(len(part), part[:1].numel()).all(1)
+            # A sum is finite only if all values are, and takes less time than a search.
+            if not math.isfinite(float(part.sum())):
+                bad[rows] |= ~torch.isfinite(part).reshape(len(part), part[:1].numel()).all(1)
 
     for_ranges(len(gaussians), threads, find)
     return bad

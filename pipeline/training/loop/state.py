@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.morton import morton_order
 from pipeline.splats.skybox import Sky
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
@@ -114,14 +113,6 @@ class TrainState:
         if psnr is not None:
             self.window.psnr += psnr
             self.window.samples += 1
-
-    def reorder(self, threads: int) -> None:
-        """Sort Gaussians along a Z-order curve: neighbours in space become neighbours in memory,
-        and the rasterizer skips invisible ones in blocks. Only right after ``refine``, when the
-        strategy has no statistics of single Gaussians."""
-        order = morton_order(self.gaussians.means, threads)
-        self.gaussians = self.gaussians.select(order, threads)
-        self.adam.select(order, torch.zeros(len(order), dtype=torch.bool), threads)
 
     def drop_unseen(self, views: int, sky: Sky | None) -> None:
         """At the end, remove Gaussians without a gradient in a whole epoch of ``views`` views: no

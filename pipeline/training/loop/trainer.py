@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.config.settled import TrainOptions
 from pipeline.render import BACKGROUNDS, Backend, Color, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.memory import freed_memory
+from pipeline.runtime.memory import release_free_memory
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.appearance.embedding import with_appearance
 from pipeline.training.data.inputs import Inputs
@@ -181,8 +181,7 @@ class Trainer:
             )
         )
         if changed:
-            with freed_memory():
-                state.reorder(self.run.threads)
+            release_free_memory()
             if not len(state.gaussians):
                 raise UserError(
                     f"no Gaussian is left at step {state.step}: all became transparent",

@@ -8,6 +8,7 @@ in 3DGS.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -83,6 +84,23 @@ class AdamOptions:
         return AdamOptions(experiments.adam_beta1, own_frames, experiments.adam_epsilon)
 
 
+@lru_cache(maxsize=1)  # A step uses them several times.
+def _rates(step: AdamStep, options: AdamOptions) -> dict[str, AdamRates]:
+    epsilon = max(options.epsilon / (3 * step.pixels), EPSILON)
+
+    def rates(*lr: float, eps: float = epsilon) -> AdamRates:
+        one_or_more = lr if len(lr) > 1 else lr[0]
+        return AdamRates(one_or_more, step.number, options.beta1, BETA2, eps)
+
+    lr = step.rates
+    found = {name: rates(getattr(lr, name)) for name in ("log_scales", "opacity_logits")}
+    found |= {"sh": rates(lr.sh0, lr.shN), "appearance": rates(lr.sh0)}
+    if options.own_frames:
+        return found | {"frames": rates(lr.means, lr.quats)}
+    # The gradient of means that move along the world's axes has another unit.
+    return found | {"means": rates(lr.means, eps=EPSILON), "quats": rates(lr.quats)}
+
+
 class Adam:
     """The moments of each row of ``Gaussians``, and its updates.
 
@@ -113,19 +131,7 @@ class Adam:
     def rates(self, step: AdamStep) -> dict[str, AdamRates]:
         """The rates of each array by its name. With ``own_frames``, ``frames`` has those of means
         and rotations."""
-        epsilon = max(self.options.epsilon / (3 * step.pixels), EPSILON)
-
-        def rates(*lr: float, eps: float = epsilon) -> AdamRates:
-            one_or_more = lr if len(lr) > 1 else lr[0]
-            return AdamRates(one_or_more, step.number, self.options.beta1, BETA2, eps)
-
-        lr = step.rates
-        found = {name: rates(getattr(lr, name)) for name in ("log_scales", "opacity_logits")}
-        found |= {"sh": rates(lr.sh0, lr.shN), "appearance": rates(lr.sh0)}
-        if self.options.own_frames:
-            return found | {"frames": rates(lr.means, lr.quats)}
-        # The gradient of means that move along the world's axes has another unit.
-        return found | {"means": rates(lr.means, eps=EPSILON), "quats": rates(lr.quats)}
+        return _rates(step, self.options)
 
     def moments(self, name: str) -> Moments:
         """The moments of an array."""
@@ -155,11 +161,8 @@ class Adam:
 
     def select(self, rows: Tensor, fresh: Tensor, threads: int = 1) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""
-        zeroed = torch.nonzero(fresh)[:, 0]
-        self.first = take_rows(self.first, rows, threads)
-        self.second = take_rows(self.second, rows, threads)
-        for tensor in (*self.first.values(), *self.second.values()):
-            tensor.index_fill_(0, zeroed, 0.0)
+        self.first = take_rows(self.first, rows, threads, fresh)
+        self.second = take_rows(self.second, rows, threads, fresh)
         self.last = self.last[rows]
 
     @property

@@ -25,11 +25,11 @@ from pipeline.training.density.growth import (
     LONG_AXIS,
     OTHER_AXES,
     SPLIT_SHRINK,
-    sample_halves,
+    sampled,
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
-from pipeline.training.density.strategy import highest, rotations
+from pipeline.training.density.strategy import Changes, Refinement, highest, rotations
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
 
@@ -78,7 +78,7 @@ def refine(
     budget: int = 1_000_000,
 ) -> Gaussians:
     step = step_of(density, gaussians, adam, densify=densify, budget=budget)
-    return density.refine(step)[0]
+    return density.refine(step).copy(step)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -92,7 +92,8 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
     rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
 
     step = step_of(density, gaussians, adam, densify=densify, budget=budget)
-    result, changes = density.refine(step)
+    refinement = density.refine(step)
+    result, changes = refinement.copy(step), refinement.changes
 
     assert len(result) == count - changes.pruned + changes.cloned + changes.split
     assert len(result) <= max(budget, count - changes.pruned)
@@ -110,6 +111,33 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
     if len(result):
         survivors = int((adam.first["opacity_logits"] > 0).sum())
         assert survivors == count - changes.pruned - changes.split
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 40), st.integers(0, 2**31))
+def test_a_selection_of_a_refinement_copies_the_selected_rows(count: int, seed: int) -> None:
+    """In any order and without some of them, changed rows included."""
+    draws = torch.Generator().manual_seed(seed)
+    found = []
+    which = torch.randperm(count, generator=draws)[: int(torch.randint(0, count + 1, (1,)))]
+    changed = torch.nonzero(torch.rand(count, generator=draws) < 0.5)[:, 0]
+    refinement = Refinement(
+        rows=torch.randint(0, 10, (count,), generator=draws),
+        fresh=torch.rand(count, generator=draws) < 0.5,
+        changed=changed,
+        values={"means": torch.rand(len(changed), 3, generator=draws)},
+        changes=Changes(),
+    )
+    for before in (True, False):
+        gaussians, adam = marked(10)
+        step = step_of(strategy(10), gaussians, adam)
+        if before:
+            result = refinement.select(which).copy(step)
+        else:
+            result = refinement.copy(step).select(which)
+            adam.select(which, torch.zeros(len(which), dtype=torch.bool))
+        found.append([*result.tensors().values(), *adam.first.values(), *adam.second.values()])
+    assert all(map(torch.equal, *found))
 
 
 def test_the_budget_goes_to_the_largest_gradients() -> None:
@@ -147,10 +175,10 @@ def test_steps_without_the_gaussian_do_not_change_its_mean_gradient() -> None:
 def test_sampled_halves_keep_the_mean_and_shrink() -> None:
     one = ball(1, 4)
     count = 20_000
-    gaussians = one.select(torch.zeros(count, dtype=torch.int64))
-    sample_halves(gaussians, slice(0, count), np.random.Generator(np.random.PCG64(0)))
-    assert torch.allclose(gaussians.log_scales, one.log_scales - math.log(SPLIT_SHRINK))
-    offset = (gaussians.means - one.means).double()
+    halves = one.select(torch.zeros(count, dtype=torch.int64))
+    values = sampled(halves, np.random.Generator(np.random.PCG64(0)))
+    assert torch.allclose(values["log_scales"], one.log_scales - math.log(SPLIT_SHRINK))
+    offset = (values["means"] - one.means).double()
     sigma = one.log_scales.exp().max().item()
     assert offset.mean(0).abs().max() < 5 * sigma / math.sqrt(count)
     # Drawn from the Gaussian itself: its covariance R S S R^T.
@@ -230,9 +258,8 @@ def test_the_sky_is_neither_reset_nor_too_large() -> None:
     assert torch.allclose(torch.sigmoid(gaussians.opacity_logits[1:]), torch.tensor(0.01))
     after_reset = density.reset_interval + 1
     due = next(n for n in range(after_reset, 30_000) if density.prunes_large_after(n))
-    refined, _ = density.refine(
-        DensityStep(gaussians, adam, np.random.default_rng(0), range(due, due + 1))
-    )
+    step = DensityStep(gaussians, adam, np.random.default_rng(0), range(due, due + 1))
+    refined = density.refine(step).copy(step)
     assert refined.log_scales.max() == 5.0 and len(refined) == 5
 
 
@@ -248,7 +275,8 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
     gaussians.opacity_logits[torch.from_numpy(faint)] = -9.0
     density = mcmc(growth_share=0.2)
     step = step_of(density, gaussians, adam, densify=densify, budget=budget, seed=seed)
-    result, changes = density.refine(step)
+    refinement = density.refine(step)
+    result, changes = refinement.copy(step), refinement.changes
     alive = count - int(faint.sum())
     if densify and alive:
         assert len(result) == max(count, min(budget, math.ceil(1.2 * count)))
@@ -364,9 +392,9 @@ def test_the_published_strategy_prunes_after_it_densifies() -> None:
     density.observed.seen += 1
     density.observed.gradient_sum = torch.tensor([3e-4, 3e-4, 3e-4, 0.0])
     rng = np.random.Generator(np.random.PCG64(0))
-    result, changes = density.refine(
-        DensityStep(gaussians, adam, rng, range(9000, 9001), budget=100)
-    )
+    step = DensityStep(gaussians, adam, rng, range(9000, 9001), budget=100)
+    refinement = density.refine(step)
+    result, changes = refinement.copy(step), refinement.changes
     assert (changes.cloned, changes.split, changes.pruned) == (1, 2, 3)
     scales = result.log_scales.exp()[:, 0]
     assert torch.allclose(scales, torch.tensor([0.009, 0.009, 0.0125, 0.0125]))

@@ -11,8 +11,9 @@
 namespace splat {
 namespace {
 
-// Number of parts for each thread: visible Gaussians are distributed unevenly.
-constexpr int kPartsPerThread = 4;
+// Number of parts for each thread, and the least number of all: visible Gaussians are distributed
+// unevenly.
+constexpr int kPartsPerThread = 4, kLeastParts = 16;
 
 // Number of tiles whose pairs are summed at a time: some cache lines of counts.
 constexpr int64_t kSummedTiles = 128;
@@ -179,7 +180,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
     tiles_ = view.tiles();
     slots_ = slots;
     const uint32_t tiles_x = uint32_t(view.tiles_x());
-    const int parts = threads * kPartsPerThread;
+    const int parts = std::max(threads * kPartsPerThread, kLeastParts);
     parts_ = std::vector<Part>(parts);
     std::atomic<int64_t> total{0};
     parallel_for(parts, 1, threads, [&](int64_t number) {
@@ -251,17 +252,20 @@ void Binner::place_pairs(int64_t* tile_begin) {
     // The counts of all parts grow with the number of threads: their sum over the tiles before each
     // range, by range, and then the places in each.
     std::vector<int64_t> before((tiles_ + kSummedTiles - 1) / kSummedTiles, 0);
-    parallel_ranges(tiles_, kSummedTiles, threads_, [&](int64_t begin, int64_t end) {
+    const auto end_of = [&](int64_t range) { return std::min((range + 1) * kSummedTiles, tiles_); };
+    const int64_t ranges = int64_t(before.size());
+    parallel_for(ranges, 1, threads_, [&](int64_t range) {
         int64_t pairs = 0;
         for (const Part& part : parts_)
-            for (int64_t tile = begin; tile < end; tile++) pairs += part.tile_count[tile];
-        before[begin / kSummedTiles] = pairs;
+            for (int64_t tile = range * kSummedTiles; tile < end_of(range); tile++)
+                pairs += part.tile_count[tile];
+        before[range] = pairs;
     });
     int64_t total = 0;
     for (int64_t& pairs : before) total += std::exchange(pairs, total);
-    parallel_ranges(tiles_, kSummedTiles, threads_, [&](int64_t begin, int64_t end) {
-        int64_t place = before[begin / kSummedTiles];
-        for (int64_t tile = begin; tile < end; tile++) {
+    parallel_for(ranges, 1, threads_, [&](int64_t range) {
+        int64_t place = before[range];
+        for (int64_t tile = range * kSummedTiles; tile < end_of(range); tile++) {
             tile_begin[tile] = place;
             for (Part& part : parts_)
                 place += std::exchange(part.tile_count[tile], uint32_t(place));

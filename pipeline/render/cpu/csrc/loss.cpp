@@ -15,6 +15,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 #include "memory.h"
@@ -33,8 +34,9 @@ constexpr float kC1 = 1e-4f, kC2 = 9e-4f;
 // Maximum floats of a strip's row: the buffered rows take about 300 KB, less than half an L2 cache.
 constexpr int64_t kStripFloats = 1024;
 
-// Minimum rows of a band that starts in the middle of a strip: it processes 10 more on each side.
-constexpr int64_t kBandRows = 32;
+// Minimum rows of a band, and the rows whose processing takes as long as that of the rows above and
+// below a band, of which it computes a part.
+constexpr int64_t kBandRows = 16, kMoreRows = 8;
 
 struct Window {
     float tap[kRadius + 1];  // from the centre outwards
@@ -301,6 +303,17 @@ class Strip {
     float *line_[2][4], *inside_;
 };
 
+// Number of bands of each strip, such that threads which take one after another end earliest.
+int64_t bands_of(int64_t strips, int64_t height, int64_t threads) {
+    int64_t best = 1, least = std::numeric_limits<int64_t>::max();
+    for (int64_t bands = 1; bands <= height / kBandRows; bands++) {
+        const int64_t rounds = (strips * bands + threads - 1) / threads;
+        const int64_t rows = rounds * ((height + bands - 1) / bands + (bands > 1 ? kMoreRows : 0));
+        if (rows < least) best = bands, least = rows;
+    }
+    return best;
+}
+
 // Number of unmasked values.
 int64_t count_values(const LossImages& in, int threads) {
     const int64_t pixels = in.width * in.height;
@@ -327,7 +340,7 @@ LossValues l1_ssim(const LossImages& in, const LossWeights& weights, int threads
     // depend on the number of threads.
     const int64_t strips = (values + kStripFloats - 1) / kStripFloats;
     const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
-    const int64_t bands = std::max(std::min(int64_t(threads), height / kBandRows), int64_t(1));
+    const int64_t bands = bands_of(strips, height, threads);
     std::vector<double> row_error(strips * height), row_ssim(strips * height);
     parallel_for(strips * bands, 1, threads, [&](int64_t unit) {
         const int64_t number = unit / bands, band = unit % bands, begin = number * across;

@@ -17,6 +17,9 @@ namespace {
 
 // Time that a thread polls for work before it sleeps: longer than the serial part of a step.
 constexpr auto kWatch = std::chrono::milliseconds(10);
+// The last ranges are smaller by this factor, so that threads finish at about the same time. They
+// are as many as kLast whole ranges for each thread.
+constexpr int64_t kFiner = 4, kLast = 2;
 // Number of polls between two yields of the processor. Yielding lets other processes run: two
 // training runs share two processors fairly.
 constexpr int kLooks = 16;
@@ -45,6 +48,7 @@ class Crew {
         }
         hire(helpers);
         body_ = body, context_ = context, count_ = count, grain_ = grain;
+        whole_ = std::max<int64_t>(0, ranges - kLast * (helpers + 1));
         next_.store(0, std::memory_order_relaxed);
         // Next generation, open, no threads inside.
         const uint64_t generation = state_.load(std::memory_order_relaxed) / kGeneration + 1;
@@ -81,10 +85,14 @@ class Crew {
     }
 
     void work() {
+        const int64_t fine = std::max<int64_t>(1, grain_ / kFiner);
         for (;;) {
-            const int64_t begin = next_.fetch_add(grain_, std::memory_order_relaxed);
+            const int64_t number = next_.fetch_add(1, std::memory_order_relaxed);
+            const bool whole = number < whole_;
+            const int64_t begin =
+                whole ? number * grain_ : whole_ * grain_ + (number - whole_) * fine;
             if (begin >= count_) return;
-            body_(context_, begin, std::min(begin + grain_, count_));
+            body_(context_, begin, std::min(begin + (whole ? grain_ : fine), count_));
         }
     }
 
@@ -140,6 +148,7 @@ class Crew {
     RangeBody body_;
     const void* context_;
     int64_t count_, grain_;
+    int64_t whole_;  // number of ranges of `grain_`
     alignas(64) std::atomic<int64_t> next_{0};
 };
 

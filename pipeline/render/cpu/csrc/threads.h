@@ -10,8 +10,9 @@ namespace splat {
 using RangeBody = void (*)(const void* context, int64_t begin, int64_t end);
 void run_ranges(int64_t count, int64_t grain, int threads, RangeBody body, const void* context);
 
-// Calls body(begin, end) for [0, count) in ranges of `grain`, on at most `threads` threads
-// including the caller. Which thread runs which range is not determined.
+// Calls body(begin, end) for [0, count) in ranges of about `grain`, on at most `threads` threads
+// including the caller. The ranges and which thread runs which one are not determined: the last
+// ones are smaller, and all are one if another loop occupies the threads.
 template <class Body>
 void parallel_ranges(int64_t count, int64_t grain, int threads, const Body& body) {
     const auto call = [](const void* context, int64_t begin, int64_t end) {

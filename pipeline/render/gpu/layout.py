@@ -52,7 +52,7 @@ def written_gradients(*, camera: bool, colors: bool, frames: bool) -> dict[str, 
 
 def moments(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> Tensors:
     """The tensors of the array of moments, by the names of its sections, in order."""
-    found = {}
+    found: Tensors = {}
     for name in MOMENTS:
         found |= {f"first {name}": first[name], f"second {name}": second[name]}
     return found

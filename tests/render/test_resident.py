@@ -77,7 +77,9 @@ STEPS = {
     "a block": replace(STEP, image=replace(MASKED, surroundings=AROUND), losses=constant_losses),
     "an appearance": replace(STEP, embedding=(0.7, -1.2)),
     "antialiased": replace(STEP, options=RasterOptions(antialias=True)),
+    "all that read gradients": replace(STEP, camera_gradients=True, embedding=(0.7, -1.2)),
 }
+WORLDS_AXES = ("world's axes", "all that read gradients")
 
 
 class State:
@@ -162,7 +164,7 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
     backend, step = make_backend("gpu"), STEPS[name]
     training = backend.resident()
     assert training is not None
-    ours, theirs, untouched = (State(step.embedding, name != "world's axes") for _ in range(3))
+    ours, theirs, untouched = (State(step.embedding, name not in WORLDS_AXES) for _ in range(3))
     training.load(ours.optimised)
     for number in (1, 2, 5):
         training.step(replace(step, adam=ours.adam.rates(adam_step(number))))

@@ -31,7 +31,7 @@ from benchmarks.record_tables import levels
 from benchmarks.results import LevelResult
 from pipeline.config.schema import Split
 from pipeline.demo.options import picture_size
-from pipeline.io.streamed_sog import LEAF, LEVELS
+from pipeline.io.streamed_sog import LEAF, num_levels
 from pipeline.metrics.image import psnr
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.render import RasterOptions
@@ -54,8 +54,9 @@ def whole_levels(gaussians: GaussianArrays) -> list[GaussianArrays]:
         return [leaf for child in chunk.children for leaf in leaves(child)] or [chunk]
 
     tree = chunks_of(gaussians.means, np.arange(len(gaussians)), LEAF)
+    count = num_levels(len(gaussians))
     parts = [
-        list(levels_of(collect(GaussianRows(gaussians, leaf.rows, gaussians.sh_degree)), LEVELS))
+        list(levels_of(collect(GaussianRows(gaussians, leaf.rows, gaussians.sh_degree)), count))
         for leaf in leaves(tree)
     ]
     return [

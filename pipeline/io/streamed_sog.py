@@ -111,7 +111,7 @@ def write_streamed_sog(
         gaussians = replace(gaussians, rows=gaussians.rows[~sky])
         blocks = None if blocks is None else blocks[~sky]
     tree = chunks_of(gaussians.source.means, gaussians.rows, LEAF, blocks)
-    levels = [_Level() for _ in range(_num_levels(len(gaussians)))]
+    levels = [_Level() for _ in range(num_levels(len(gaussians)))]
     progress = Progress("writing levels of detail", len(gaussians), "Gaussians")
     files = _Files(folder, antialias, levels, progress)
     root = _write_node(gaussians, tree, files)
@@ -130,7 +130,8 @@ def write_streamed_sog(
     write_text(folder / LOD_META, meta.model_dump_json(exclude_none=True))
 
 
-def _num_levels(count: int) -> int:
+def num_levels(count: int) -> int:
+    """The number of levels of ``count`` Gaussians."""
     return max(LEVELS, 1 + (count // FIRST_PICTURE).bit_length())
 
 

@@ -81,7 +81,7 @@ def test_the_coarsest_level_is_one_file(folder) -> None:
 
 @pytest.mark.parametrize("count", [1, 10**5, 2**17, 10**6, 3 * 10**7, 10**9])
 def test_scenes_of_any_size_have_levels_until_the_first_picture_is_small(count) -> None:
-    levels = streamed_sog._num_levels(count)
+    levels = streamed_sog.num_levels(count)
     assert levels >= LEVELS and count / 2 ** (levels - 1) <= streamed_sog.FIRST_PICTURE
 
 

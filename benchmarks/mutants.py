@@ -199,8 +199,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "split_grows": Mutant(
         "pipeline/training/density/growth.py",
-        "gaussians.log_scales[rows] -= math.log(SPLIT_SHRINK)",
-        "gaussians.log_scales[rows] += math.log(SPLIT_SHRINK)",
+        "halves.log_scales - math.log(SPLIT_SHRINK)",
+        "halves.log_scales + math.log(SPLIT_SHRINK)",
         "halves of a split larger than the whole",
         ("tests/training/density/test_density.py",),
     ),

@@ -102,7 +102,7 @@ def write_streamed_sog(
     """
     environment = None
     if sky is not None and sky.sum() > FIRST_PICTURE:
-        # In leaves of the scene, the sky would make their boxes large.
+        # If leaves of the scene contained sky, their boxes would be large.
         blocks = np.where(sky, 0, 1 if blocks is None else blocks)
     elif sky is not None and 0 < sky.sum() < len(gaussians):
         environment = ENVIRONMENT

@@ -33,7 +33,7 @@ const kColors = 4u;  // writes the gradients of colours
 @group(0) @binding(10) var<storage, read_write> exp_avg: array<f32>;  // of sh
 @group(0) @binding(11) var<storage, read_write> exp_avg_sq: array<f32>;
 @group(0) @binding(12) var<storage, read_write> last_step: array<i32>;
-// Of geometry: first and second moments of log scales, of opacities, of means and of rotations.
+// The first and the second moments of log scales, then those of opacities, of means and of rotations.
 @group(0) @binding(13) var<storage, read_write> moments: array<f32>;
 @group(0) @binding(14) var<storage, read_write> statistics: array<f32>;  // (2, N)
 @group(0) @binding(15) var<storage, read_write> gradients: array<f32>;

@@ -17,6 +17,7 @@
 #include "project.h"
 #include "step.h"
 #include "surroundings.h"
+#include "threads.h"
 
 namespace {
 
@@ -293,6 +294,11 @@ void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scal
                       means.size(0), settings_from(adam), int(threads));
 }
 
+std::tuple<double, double> loop_time() {
+    const splat::LoopTime time = splat::loop_time();
+    return {time.loops, time.threads};
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY(splatmake, m) {
@@ -342,6 +348,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor(f!) rotation_avg_sq, Tensor adam, int threads) -> ()");
     m.def("release_memory() -> ()");
     m.def("save_memory(bool little) -> ()");
+    m.def("loop_time() -> (float, float)");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
@@ -365,4 +372,5 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CompositeExplicitAutograd, m) {
     m.impl("release_memory", TORCH_BOX(&splat::release_unused_memory));
     m.impl("save_memory", TORCH_BOX(&splat::save_memory));
+    m.impl("loop_time", TORCH_BOX(&loop_time));
 }

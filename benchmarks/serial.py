@@ -54,10 +54,7 @@ KERNELS = {
     "blend": "blend",
     "l1_ssim": "loss",
     "blend_backward": "blend backward",
-    "project_backward": "projection, SH backward",
-    "frame_adam": "Adam",
-    "adam_step": "Adam",
-    "observe_gradients": "density statistics",
+    "project_backward_update": "projection, SH backward; Adam",
     "scale_colors": "light",
     "mean_squared_error": "PSNR",
 }

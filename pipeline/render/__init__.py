@@ -19,6 +19,7 @@ from pipeline.render.types import (
     Color,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
     LossResult,
     Moments,
@@ -27,6 +28,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ __all__ = [
     "Color",
     "Forward",
     "FrameMoments",
+    "GaussianAdam",
     "Gradients",
     "LossResult",
     "Moments",
@@ -49,6 +52,7 @@ __all__ = [
     "ShAdam",
     "Subset",
     "Surroundings",
+    "ViewGradients",
     "make_backend",
 ]
 

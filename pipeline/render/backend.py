@@ -23,6 +23,7 @@ from pipeline.render.types import (
     AlphaChangeLoss,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
     LossResult,
     Moments,
@@ -31,6 +32,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 
 
@@ -228,6 +230,38 @@ class Backend(ABC, Generic[Projected, Binned]):
         scale = gradients.means2d.new_tensor([0.5 * width, 0.5 * height])
         gradient_sum += (gradients.means2d * scale).double().norm(dim=1).float()
         seen += rendered.radii > 0
+
+    def update(
+        self,
+        fwd: Forward,
+        parameters: Parameters,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        adam: GaussianAdam,
+        statistics: tuple[Tensor, Tensor] | None = None,
+        colors: bool = False,
+        camera: bool = False,
+    ) -> ViewGradients:
+        """``backward``, and then one step of Adam over all parameters, in place. A backend may do
+        both at once, without storing gradients.
+
+        Args:
+            parameters: Those of ``forward``, contiguous.
+            statistics: ``gradient_sum`` and ``seen`` of ``observe_gradients``, to which the step is
+                added.
+        """
+        means, log_scales, quats, opacity_logits, _ = parameters
+        g = self.backward(
+            fwd, d_color, d_alpha, d_depth, colors=colors, camera=camera, sh_adam=adam.sh
+        )
+        if statistics is not None:
+            self.observe_gradients(fwd, g, *statistics)
+        self.frame_adam(means, quats, log_scales, g.means, g.quats, adam.frames, adam.frame_rates)
+        self.adam_step(log_scales, g.log_scales, adam.log_scales, adam.log_scale_rates)
+        self.adam_step(opacity_logits, g.opacity_logits, adam.opacity_logits, adam.opacity_rates)
+        return ViewGradients(g.colors, g.camera)
 
     def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
         """The product of ``image`` (H, W, 3) and ``factor`` (3,) or (H, W, 3), float32."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from pipeline.render.types import (
     AdamRates,
     FrameMoments,
+    GaussianAdam,
     Moments,
     RasterCamera,
     ShAdam,
@@ -179,6 +180,20 @@ def check_frame_adam(
             if tensor.shape != shape:
                 raise ValueError(f"frame_adam: expected {shape}, found {tuple(tensor.shape)}")
     _check_rates("frame_adam", rates, count=2)
+
+
+def check_gaussian_adam(parameters: Parameters, adam: GaussianAdam) -> None:
+    """Raise ValueError if the arguments of ``update`` do not fit each other or are invalid."""
+    means, log_scales, quats, opacity_logits, sh = parameters
+    check_frame_adam((means, quats, log_scales), (means, quats), adam.frames, adam.frame_rates)
+    for parameter, moments, rates in (
+        (log_scales, adam.log_scales, adam.log_scale_rates),
+        (opacity_logits, adam.opacity_logits, adam.opacity_rates),
+    ):
+        check_adam(parameter, parameter, moments, rates)
+        if len(rates.rates) != 1 or moments.exp_avg_sq.shape != parameter.shape:
+            raise ValueError("update: scales and opacities have one rate and moments of their own")
+    check_sh_adam(adam.sh, sh)
 
 
 def _check_rates(operator: str, rates: AdamRates, count: int | None = None) -> None:

@@ -280,6 +280,35 @@ class ShAdam:
 
 
 @dataclass(frozen=True)
+class GaussianAdam:
+    """Adam over all parameters of Gaussians (``Backend.update``).
+
+    Attributes:
+        frames, frame_rates: Those of ``Backend.frame_adam``.
+        log_scales, log_scale_rates: Those of ``Backend.adam_step`` for the scales, with one rate.
+        opacity_logits, opacity_rates: The same for the opacities.
+        sh: Those of the SH coefficients.
+    """
+
+    frames: FrameMoments
+    frame_rates: AdamRates
+    log_scales: Moments
+    log_scale_rates: AdamRates
+    opacity_logits: Moments
+    opacity_rates: AdamRates
+    sh: ShAdam
+
+
+@dataclass(frozen=True)
+class ViewGradients:
+    """The gradients that ``Backend.update`` leaves to its caller: ``Gradients.colors`` and
+    ``Gradients.camera``."""
+
+    colors: Tensor | None
+    camera: CameraGradients | None
+
+
+@dataclass(frozen=True)
 class LossResult:
     """loss = (1 - w) error + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
 

@@ -20,6 +20,7 @@ from pipeline.render.types import (
     CameraGradients,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
     LossResult,
     Moments,
@@ -28,6 +29,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 from pipeline.runtime.errors import UserError
 
@@ -105,6 +107,19 @@ def _doubles(*values: float) -> Tensor:
     return torch.frombuffer(array("d", values), dtype=torch.float64)
 
 
+def _slot_gradients(
+    fwd: Forward, d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None
+) -> Tensor:
+    """(M, 16) gradients of each pair, see csrc/types.h."""
+    s: State = fwd.state
+    p = s.projected
+    d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, p.size)
+    return _ops().blend_backward(
+        p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
+        None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
+    )  # fmt: skip
+
+
 class CpuBackend(Backend[Projected, Binned]):
     """Multithreaded kernels for the vector instructions of the processor."""
 
@@ -173,18 +188,13 @@ class CpuBackend(Backend[Projected, Binned]):
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
         s: State = fwd.state
-        p, ops = s.projected, _ops()
-        d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, p.size)
-        slot_gradients = ops.blend_backward(
-            p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
-            None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
-        )  # fmt: skip
+        p, slot_gradients = s.projected, _slot_gradients(fwd, d_color, d_alpha, d_depth)
         adam: tuple[Tensor | None, ...] = None, None, None, None
         if sh_adam is not None:
             checks.check_sh_adam(sh_adam, p.inputs[4])
             moments = sh_adam.moments
             adam = moments.exp_avg, moments.exp_avg_sq, sh_adam.last, _pack_adam(sh_adam.rates)
-        found = ops.project_backward(
+        found = _ops().project_backward(
             *p.inputs, p.view, p.records, fwd.radii, s.slots, slot_gradients, colors, camera, *adam,
             p.threads,
         )  # fmt: skip
@@ -193,6 +203,39 @@ class CpuBackend(Backend[Projected, Binned]):
             d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors if colors else None,
             CameraGradients(*d_camera.split([3, 3, 2, 2])) if camera else None,
         )  # fmt: skip
+
+    def update(
+        self,
+        fwd: Forward,
+        parameters: Parameters,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
+        *,
+        adam: GaussianAdam,
+        statistics: tuple[Tensor, Tensor] | None = None,
+        colors: bool = False,
+        camera: bool = False,
+    ) -> ViewGradients:
+        s: State = fwd.state
+        p, slot_gradients = s.projected, _slot_gradients(fwd, d_color, d_alpha, d_depth)
+        checks.check_gaussian_adam(parameters, adam)
+        moments = (
+            *(adam.frames.means, adam.frames.rotations),
+            *(adam.log_scales, adam.opacity_logits, adam.sh.moments),
+        )
+        rates = adam.frame_rates, adam.log_scale_rates, adam.opacity_rates, adam.sh.rates
+        gradient_sum, seen = statistics or (None, None)
+        d_colors, d_camera = _ops().project_backward_update(
+            *parameters, p.view, p.records, fwd.radii, s.slots, slot_gradients,
+            [tensor for each in moments for tensor in (each.exp_avg, each.exp_avg_sq)],
+            adam.sh.last, [_pack_adam(each) for each in rates], gradient_sum, seen, colors, camera,
+            p.threads,
+        )  # fmt: skip
+        return ViewGradients(
+            d_colors if colors else None,
+            CameraGradients(*d_camera.split([3, 3, 2, 2])) if camera else None,
+        )
 
     def l1_ssim(
         self,

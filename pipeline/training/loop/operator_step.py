@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.render import Backend, Forward, Gradients, RasterOptions
+from torch import Tensor
+
+from pipeline.render import Backend, Forward, Gradients, RasterOptions, ViewGradients
+from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.step_view import StepView
 from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.losses.color import ColorLoss
-from pipeline.training.losses.plane import add, summed_gradients
+from pipeline.training.losses.plane import PlaneGradients, add, summed_gradients
 from pipeline.training.run import TrainingRun
 
 
@@ -43,27 +46,50 @@ class OperatorStep(StepEngine):
         color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
         self.require_finite(color.loss, view, state.step)
         others = summed_gradients(self.losses, rendered, view, state.step)
-        gradients = self.backend.backward(
+        found = self._update(
+            step,
+            drawn,
+            opacities,
             rendered,
+            PlaneGradients(add(color.d_alpha, others.alpha), others.depth),
             color.d_color,
-            add(color.d_alpha, others.alpha),
-            others.depth,
-            colors=appearance is not None,
-            camera=state.cameras.enabled,
-            sh_adam=state.adam.harmonics(step.adam),
         )
-        if opacities is not None:
-            gradients.opacity_logits.mul_(opacities.derivative)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
-        self._update_cameras(step, gradients)
-        self._observe(rendered, gradients)
-        state.adam.step(gaussians, gradients, step.adam, self.run.threads)
+        self._update_photograph(step, found)
         return [
             StepResult(
                 state.step, color.loss, color.psnr, rendered.num_visible, rendered.num_dropped
             )
         ]
+
+    def _update(
+        self,
+        step: Step,
+        drawn: Gaussians,
+        opacities: ThinnedOpacities | None,
+        rendered: Forward,
+        d_planes: PlaneGradients,
+        d_color: Tensor,
+    ) -> ViewGradients:
+        """Update the Gaussians and the statistics of density control, at once if nothing else needs
+        the gradients."""
+        state, adam = self.state, self.state.adam.of_all(step.adam)
+        colors, camera = state.appearance is not None, state.cameras.enabled
+        if adam is not None and opacities is None and state.density.statistics is not None:
+            return self.backend.update(
+                rendered, drawn.parameters(), d_color, *d_planes, adam=adam,
+                statistics=state.density.statistics, colors=colors, camera=camera,
+            )  # fmt: skip
+        gradients = self.backend.backward(
+            rendered, d_color, *d_planes, colors=colors, camera=camera,
+            sh_adam=state.adam.harmonics(step.adam),
+        )  # fmt: skip
+        if opacities is not None:
+            gradients.opacity_logits.mul_(opacities.derivative)
+        self._observe(rendered, gradients)
+        state.adam.step(state.gaussians, gradients, step.adam, self.run.threads)
+        return ViewGradients(gradients.colors, gradients.camera)
 
     def _observe(self, rendered: Forward, gradients: Gradients) -> None:
         """Let density control observe the step."""
@@ -102,7 +128,7 @@ class OperatorStep(StepEngine):
     def invalidate(self) -> None:
         """There are no copies of the tensors of the state."""
 
-    def _update_cameras(self, step: Step, gradients: Gradients) -> None:
+    def _update_photograph(self, step: Step, gradients: ViewGradients) -> None:
         """Update what belongs to the photograph: its camera and its appearance."""
         state, view = self.state, step.view
         if state.appearance is not None:

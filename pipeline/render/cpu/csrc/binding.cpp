@@ -18,6 +18,7 @@
 #include "step.h"
 #include "surroundings.h"
 #include "threads.h"
+#include "update.h"
 
 namespace {
 
@@ -156,9 +157,29 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
     return slots;
 }
 
+splat::ShAdam sh_adam_from(const Tensor& sh, const Tensor& exp_avg, const Tensor& exp_avg_sq,
+                           const Tensor& last, const Tensor& adam) {
+    const splat::AdamSettings s = settings_from(adam);
+    return {{mutable_floats(sh), mutable_floats(exp_avg), mutable_floats(exp_avg_sq),
+             last.mutable_data_ptr<int32_t>()},
+            {s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step}};
+}
+
+const splat::Slots* slots_from(const Tensor& t) {
+    return reinterpret_cast<const splat::Slots*>(t.const_data_ptr<int32_t>());
+}
+
+// The gradients of the camera's parameters, float64; no rows if not requested.
+Tensor new_camera_gradients(bool requested) {
+    return new_tensor<double>({requested ? splat::kCameraParameters : 0}, ScalarType::Double);
+}
+double* doubles_or_null(const Tensor& t) {
+    return t.numel() ? t.mutable_data_ptr<double>() : nullptr;
+}
+
 // Gradients of means, log_scales, quats, opacity_logits, sh, means2d, colours and the camera's
-// parameters (float64); the last two have no rows if not requested. With exp_avg, exp_avg_sq, last
-// and adam, sh is updated in place and its gradient has no rows.
+// parameters; the last two have no rows if not requested. With exp_avg, exp_avg_sq, last and adam,
+// sh is updated in place and its gradient has no rows.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, const Tensor& records,
@@ -167,30 +188,58 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     OptionalTensor adam, int64_t threads) {
     const int64_t n = means.size(0);
     std::optional<splat::ShAdam> sh_adam;
-    if (adam) {
-        const splat::AdamSettings s = settings_from(*adam);
-        sh_adam.emplace(
-            splat::ShAdamState{mutable_floats(sh), mutable_floats(*exp_avg),
-                               mutable_floats(*exp_avg_sq), last->mutable_data_ptr<int32_t>()},
-            splat::ShAdamSettings{s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step});
-    }
+    if (adam) sh_adam.emplace(sh_adam_from(sh, *exp_avg, *exp_avg_sq, *last, *adam));
     Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
            d_quats = new_floats({n, 4});
     Tensor d_opacity = new_floats({n}), d_sh = new_floats({adam ? 0 : n, sh.size(1), 3});
     Tensor d_means2d = new_floats({n, 2}), d_colors = new_floats({colors ? n : 0, 3});
-    Tensor d_camera =
-        new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
+    Tensor d_camera = new_camera_gradients(camera);
     splat::project_view_backward(
         gaussians_from(means, log_scales, quats, opacity_logits, sh), view_from(view), int(threads),
-        records_from(records), floats(radii),
-        reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
-        floats(slot_gradients),
+        records_from(records), floats(radii), slots_from(slots), floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
-         mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
-         mutable_floats(d_means2d), colors ? mutable_floats(d_colors) : nullptr,
-         camera ? d_camera.mutable_data_ptr<double>() : nullptr},
-        adam ? &*sh_adam : nullptr);
+         mutable_floats(d_opacity), mutable_floats(d_means2d),
+         adam ? nullptr : mutable_floats(d_sh), colors ? mutable_floats(d_colors) : nullptr},
+        doubles_or_null(d_camera), adam ? &*sh_adam : nullptr, nullptr);
     return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera};
+}
+
+// Updates all parameters and, if given, the statistics; returns the gradients of colours and of the
+// camera's parameters. moments: the first and the second of means, rotations, log_scales,
+// opacity_logits and sh. adams: of means and rotations, log_scales, opacity_logits and sh.
+std::tuple<Tensor, Tensor> project_backward_update(
+    const Tensor& means, const Tensor& log_scales, const Tensor& quats,
+    const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, const Tensor& records,
+    const Tensor& radii, const Tensor& slots, const Tensor& slot_gradients,
+    std::vector<Tensor> moments, const Tensor& last, std::vector<Tensor> adams,
+    OptionalTensor gradient_sum, OptionalTensor seen, bool colors, bool camera, int64_t threads) {
+    const splat::View from = view_from(view);
+    const splat::ShAdam sh_adam = sh_adam_from(sh, moments[8], moments[9], last, adams[3]);
+    const auto moment = [&](int i) { return mutable_floats(moments[i]); };
+    const splat::GaussianUpdate update = {mutable_floats(means),
+                                          mutable_floats(quats),
+                                          mutable_floats(log_scales),
+                                          mutable_floats(opacity_logits),
+                                          {moment(0), moment(1), moment(2), moment(3)},
+                                          {moment(4), moment(5)},
+                                          {moment(6), moment(7)},
+                                          settings_from(adams[0]),
+                                          settings_from(adams[1]),
+                                          settings_from(adams[2]),
+                                          gradient_sum ? mutable_floats(*gradient_sum) : nullptr,
+                                          seen ? mutable_floats(*seen) : nullptr,
+                                          floats(radii),
+                                          0.5 * double(from.width),
+                                          0.5 * double(from.height)};
+    Tensor d_colors = new_floats({colors ? means.size(0) : 0, 3});
+    Tensor d_camera = new_camera_gradients(camera);
+    splat::project_view_backward(gaussians_from(means, log_scales, quats, opacity_logits, sh), from,
+                                 int(threads), records_from(records), floats(radii),
+                                 slots_from(slots), floats(slot_gradients),
+                                 {nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
+                                  colors ? mutable_floats(d_colors) : nullptr},
+                                 doubles_or_null(d_camera), &sh_adam, &update);
+    return {d_colors, d_camera};
 }
 
 splat::LossImages images_from(const Tensor& rendered, const Tensor& target,
@@ -325,6 +374,12 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? adam, int threads) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
+        "project_backward_update(Tensor(a!) means, Tensor(b!) log_scales, Tensor(c!) quats, "
+        "Tensor(d!) opacity_logits, Tensor(e!) sh, Tensor view, Tensor records, Tensor radii, "
+        "Tensor slots, Tensor slot_gradients, Tensor(f!)[] moments, Tensor(g!) last, "
+        "Tensor[] adams, Tensor(h!)? gradient_sum, Tensor(i!)? seen, bool colors, bool camera, "
+        "int threads) -> (Tensor, Tensor)");
+    m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, "
         "float l2_weight, int threads) -> (float, float, float, Tensor)");
     m.def("mean_squared_error(Tensor rendered, Tensor target, Tensor? mask, int threads) -> float");
@@ -358,6 +413,7 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("blend_depth", TORCH_BOX(&blend_depth));
     m.impl("blend_backward", TORCH_BOX(&blend_backward));
     m.impl("project_backward", TORCH_BOX(&project_backward));
+    m.impl("project_backward_update", TORCH_BOX(&project_backward_update));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
     m.impl("mean_squared_error", TORCH_BOX(&mean_squared_error));
     m.impl("compose", TORCH_BOX(&compose));

@@ -40,7 +40,9 @@ class Sum {
     void operator+=(Clock::duration more) {
         ticks_.fetch_add(more.count(), std::memory_order_relaxed);
     }
-    double seconds() const { return std::chrono::duration<double>(Clock::duration(ticks_)).count(); }
+    double seconds() const {
+        return std::chrono::duration<double>(Clock::duration(ticks_)).count();
+    }
 
   private:
     std::atomic<Clock::rep> ticks_{0};

@@ -54,9 +54,7 @@ KERNELS = {
     "blend": "blend",
     "l1_ssim": "loss",
     "blend_backward": "blend backward",
-    "project_backward_update": "projection, SH backward; Adam",
-    "scale_colors": "light",
-    "mean_squared_error": "PSNR",
+    "project_backward_update": "projection backward, Adam",
 }
 CONTROL, REST = "density control", "other Python and torch"
 ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, REST)

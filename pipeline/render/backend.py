@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from pipeline.render import checks
@@ -126,6 +125,8 @@ class Backend(ABC, Generic[Projected, Binned]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
         """The loss (1 - w) E + w (1 - SSIM) and its gradient with respect to the rendered image.
 
@@ -139,19 +140,8 @@ class Backend(ABC, Generic[Projected, Binned]):
                 by the target there, and both means are over the other pixels.
             l2_weight: k >= 0.
             threads: The number of threads, 0 for all.
+            factor: (3,) or (H, W, 3) float32, of the rendered image; None: 1.
         """
-
-    def mean_squared_error(
-        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
-    ) -> float:
-        """The mean squared error of the images of ``l1_ssim`` without ignored pixels; 0 if all
-        are ignored."""
-        rendered, target, mask = checks.images(rendered, target, mask)
-        scale = 255.0 if target.dtype == torch.uint8 else 1.0
-        difference = rendered.double() - (target.float() / scale).double()
-        if mask is not None:
-            difference = difference[mask == 0]
-        return float(difference.square().mean()) if difference.numel() else 0.0
 
     @abstractmethod
     def compose(
@@ -252,6 +242,7 @@ class Backend(ABC, Generic[Projected, Binned]):
             statistics: ``gradient_sum`` and ``seen`` of ``observe_gradients``, to which the step is
                 added.
         """
+        checks.check_update(parameters, adam, statistics, len(fwd.radii))
         means, log_scales, quats, opacity_logits, _ = parameters
         g = self.backward(
             fwd, d_color, d_alpha, d_depth, colors=colors, camera=camera, sh_adam=adam.sh
@@ -262,10 +253,6 @@ class Backend(ABC, Generic[Projected, Binned]):
         self.adam_step(log_scales, g.log_scales, adam.log_scales, adam.log_scale_rates)
         self.adam_step(opacity_logits, g.opacity_logits, adam.opacity_logits, adam.opacity_rates)
         return ViewGradients(g.colors, g.camera)
-
-    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
-        """The product of ``image`` (H, W, 3) and ``factor`` (3,) or (H, W, 3), float32."""
-        return image * factor
 
     def forward(
         self,

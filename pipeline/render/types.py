@@ -310,9 +310,11 @@ class ViewGradients:
 
 @dataclass(frozen=True)
 class LossResult:
-    """loss = (1 - w) error + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
+    """loss = (1 - w) error + w (1 - ssim), its parts, the mean squared error (0 if all pixels are
+    ignored), and dL/d(rendered) (H, W, 3) float32."""
 
     loss: float
     error: float
     ssim: float
+    squared_error: float
     grad: Tensor

@@ -219,7 +219,7 @@ class CpuBackend(Backend[Projected, Binned]):
     ) -> ViewGradients:
         s: State = fwd.state
         p, slot_gradients = s.projected, _slot_gradients(fwd, d_color, d_alpha, d_depth)
-        checks.check_gaussian_adam(parameters, adam)
+        checks.check_update(parameters, adam, statistics, len(fwd.radii))
         moments = (
             *(adam.frames.means, adam.frames.rotations),
             *(adam.log_scales, adam.opacity_logits, adam.sh.moments),
@@ -245,15 +245,13 @@ class CpuBackend(Backend[Projected, Binned]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
-        images = checks.images(rendered, target, mask)
-        return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
-
-    def mean_squared_error(
-        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
-    ) -> float:
-        images = checks.images(rendered, target, mask)
-        return float(_ops().mean_squared_error(*images, _threads(threads)))
+        rendered, target, mask, factor = checks.images(rendered, target, mask, factor)
+        weights = ssim_weight, l2_weight
+        found = _ops().l1_ssim(rendered, factor, target, mask, *weights, _threads(threads))
+        return LossResult(*found)
 
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
@@ -293,12 +291,6 @@ class CpuBackend(Backend[Projected, Binned]):
         height, width = rendered.alpha.shape
         tensors = means2d, rendered.radii, gradient_sum, seen
         _ops().observe_gradients(*tensors, 0.5 * width, 0.5 * height, _threads(threads))
-
-    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
-        image = checks.checked("image", image, (None, None, 3))
-        shape = (3,) if factor.dim() == 1 else tuple(image.shape)
-        factor = checks.checked("factor", factor, shape)
-        return _ops().scale_colors(image, factor, _threads(threads))
 
     def adam_step(
         self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0

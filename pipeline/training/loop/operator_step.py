@@ -43,7 +43,7 @@ class OperatorStep(StepEngine):
         if opacities is not None:
             drawn = replace(gaussians, opacity_logits=opacities.logits)
         rendered = self.backend.forward(*drawn.parameters(), view.camera, step.options)
-        color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
+        color = self.color_loss.gradients(rendered, view)
         self.require_finite(color.loss, view, state.step)
         others = summed_gradients(self.losses, rendered, view, state.step)
         found = self._update(
@@ -118,9 +118,7 @@ class OperatorStep(StepEngine):
         rendered = self.backend.forward(*gaussians.parameters(), view.camera, options)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
-        found = self.color_loss.gradients(rendered, view, measures_psnr=True).psnr
-        assert found is not None
-        return found
+        return self.color_loss.gradients(rendered, view).psnr
 
     def fetch(self) -> None:
         """The tensors of the state are always current."""

@@ -242,31 +242,25 @@ std::tuple<Tensor, Tensor> project_backward_update(
     return {d_colors, d_camera};
 }
 
-splat::LossImages images_from(const Tensor& rendered, const Tensor& target,
-                              const OptionalTensor& mask) {
+// loss, error, ssim, squared error, (H, W, 3) gradient
+std::tuple<double, double, double, double, Tensor> l1_ssim(const Tensor& rendered,
+                                                           OptionalTensor factor,
+                                                           const Tensor& target,
+                                                           OptionalTensor mask, double ssim_weight,
+                                                           double l2_weight, int64_t threads) {
     const bool bytes = target.scalar_type() == ScalarType::Byte;
-    return {rendered.size(1),
-            rendered.size(0),
-            floats(rendered),
-            bytes ? nullptr : floats(target),
-            bytes ? target.const_data_ptr<uint8_t>() : nullptr,
-            mask ? mask->const_data_ptr<uint8_t>() : nullptr};
-}
-
-// loss, error, ssim, (H, W, 3) gradient
-std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
-                                                   OptionalTensor mask, double ssim_weight,
-                                                   double l2_weight, int64_t threads) {
+    const splat::LossImages images = {rendered.size(1),
+                                      rendered.size(0),
+                                      floats(rendered),
+                                      floats(factor),
+                                      factor && factor->dim() == 3,
+                                      bytes ? nullptr : floats(target),
+                                      bytes ? target.const_data_ptr<uint8_t>() : nullptr,
+                                      mask ? mask->const_data_ptr<uint8_t>() : nullptr};
     Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
     const splat::LossValues values =
-        splat::l1_ssim(images_from(rendered, target, mask), {ssim_weight, l2_weight}, int(threads),
-                       mutable_floats(grad));
-    return {values.loss, values.error, values.ssim, grad};
-}
-
-double mean_squared_error(const Tensor& rendered, const Tensor& target, OptionalTensor mask,
-                          int64_t threads) {
-    return splat::mean_squared_error(images_from(rendered, target, mask), int(threads));
+        splat::l1_ssim(images, {ssim_weight, l2_weight}, int(threads), mutable_floats(grad));
+    return {values.loss, values.error, values.ssim, values.squared_error, grad};
 }
 
 splat::Surroundings surroundings_from(const Tensor& behind, const Tensor& alpha,
@@ -313,13 +307,6 @@ void observe_gradients(const Tensor& means2d, const Tensor& radii, const Tensor&
 }
 
 // (H, W, 3) image
-Tensor scale_colors(const Tensor& image, const Tensor& factor, int64_t threads) {
-    Tensor scaled = new_floats({image.size(0), image.size(1), 3});
-    splat::scale_colors(floats(image), floats(factor), factor.numel(), image.numel(), int(threads),
-                        mutable_floats(scaled));
-    return scaled;
-}
-
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                const Tensor& exp_avg_sq, const Tensor& adam, int64_t threads) {
     const splat::AdamSettings settings = settings_from(adam);
@@ -380,9 +367,8 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor[] adams, Tensor(h!)? gradient_sum, Tensor(i!)? seen, bool colors, bool camera, "
         "int threads) -> (Tensor, Tensor)");
     m.def(
-        "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, "
-        "float l2_weight, int threads) -> (float, float, float, Tensor)");
-    m.def("mean_squared_error(Tensor rendered, Tensor target, Tensor? mask, int threads) -> float");
+        "l1_ssim(Tensor rendered, Tensor? factor, Tensor target, Tensor? mask, float ssim_weight, "
+        "float l2_weight, int threads) -> (float, float, float, float, Tensor)");
     m.def(
         "compose(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
         "Tensor? correction, Tensor color, Tensor alpha, int threads) -> Tensor");
@@ -393,7 +379,6 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "observe_gradients(Tensor means2d, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) seen, "
         "float scale_x, float scale_y, int threads) -> ()");
-    m.def("scale_colors(Tensor image, Tensor factor, int threads) -> Tensor");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor adam, int threads) -> ()");
@@ -415,11 +400,9 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("project_backward", TORCH_BOX(&project_backward));
     m.impl("project_backward_update", TORCH_BOX(&project_backward_update));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
-    m.impl("mean_squared_error", TORCH_BOX(&mean_squared_error));
     m.impl("compose", TORCH_BOX(&compose));
     m.impl("compose_backward", TORCH_BOX(&compose_backward));
     m.impl("observe_gradients", TORCH_BOX(&observe_gradients));
-    m.impl("scale_colors", TORCH_BOX(&scale_colors));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }

@@ -24,6 +24,7 @@ from types import MappingProxyType
 import numpy as np
 from PIL import Image
 
+from benchmarks.card.__main__ import INSTALLED
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.ply import read_splat_ply
 from pipeline.io.spz import write_spz
@@ -35,7 +36,7 @@ MOST_MB = 62.0
 QUALITY = 95  # Of the JPEG files.
 PYTHON = "3.12"
 #: What pip resolves, besides the packages that the machine has.
-WHEELS = ("wgpu>=0.32,<0.33", "pydantic>=2.14,<3", "ninja", "jaxtyping", "rich")
+WHEELS = ("wgpu>=0.32,<0.33", "pydantic>=2.14,<3", "zstandard", "ninja", "jaxtyping", "rich")
 #: Dependencies of these that the machine has, and keeps.
 PRESENT = ("numpy",)
 GSPLAT = "gsplat==1.5.3"
@@ -158,6 +159,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scene", type=Path, required=True, help="folder of images and sparse/0")
     parser.add_argument("--views", type=int, default=150, help="at most (default: 150)")
     options = parser.parse_args(arguments)
+    # What ``benchmarks.card`` has installed there is of the pack before.
+    shutil.rmtree(options.folder / INSTALLED, ignore_errors=True)
     try:
         pack_scene(options.folder, options.export, options.scene, options.views)
         download(options.folder)

@@ -365,7 +365,11 @@ def serial_table(found: Sequence[SerialResult]) -> str:
     rows = [
         [
             *("Gaussians", "phase", "1 thread (ms)", "n threads (ms)", "n", "speed-up"),
-            *("of all threads without waits (ms)", "serial, of the step", "waits, of the step"),
+            *(
+                "all n threads without waits (ms)",
+                "serial part",
+                "serial part without memory traffic",
+            ),
         ]
     ]
     for r in found:

@@ -19,12 +19,13 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
 import torch
@@ -40,6 +41,7 @@ from pipeline.render.cpu import backend as cpu
 from pipeline.runtime.torch_threads import single_torch_thread
 from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View, scene_extent
+from pipeline.splats import rows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.gradient import GradientDensity
@@ -73,13 +75,42 @@ class Time:
     @staticmethod
     def now() -> Time:
         wall, (loops, threads) = time.perf_counter(), cpu._ops().loop_time()
-        return Time(wall, wall - loops + threads)
+        return Time(wall, wall - loops + threads - Pool.loops + Pool.threads)
 
     def __add__(self, other: Time) -> Time:
         return Time(self.wall + other.wall, self.busy + other.busy)
 
     def __sub__(self, other: Time) -> Time:
         return Time(self.wall - other.wall, self.busy - other.busy)
+
+
+class Pool(ThreadPoolExecutor):
+    """The pool that searches and copies rows (``for_ranges``).
+
+    Attributes:
+        loops, threads: The seconds of all pools together, and of their threads at work.
+    """
+
+    loops = threads = 0.0
+
+    def __enter__(self) -> Self:
+        self._start = time.perf_counter()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        Pool.loops += time.perf_counter() - self._start
+
+    def map(  # type: ignore[override]
+        self, work: Callable[..., Any], *items: Any
+    ) -> Iterator[Any]:
+        def timed(*item: Any) -> tuple[Any, float]:
+            start = time.perf_counter()
+            return work(*item), time.perf_counter() - start
+
+        for found, seconds in super().map(timed, *items):
+            Pool.threads += seconds
+            yield found
 
 
 class Phases:
@@ -137,7 +168,10 @@ class Run:
         self._timed_step = timed(REST, trainer.step)
 
     def step(self) -> None:
-        with mock.patch.object(cpu, "_ops", lambda: self._operators):
+        with (
+            mock.patch.object(cpu, "_ops", lambda: self._operators),
+            mock.patch.object(rows, "ThreadPoolExecutor", Pool),
+        ):
             self._timed_step()
 
     def turn(self) -> Turn:

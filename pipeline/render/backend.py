@@ -24,6 +24,7 @@ from pipeline.render.types import (
     FrameMoments,
     GaussianAdam,
     Gradients,
+    ImageGradients,
     LossResult,
     Moments,
     RasterCamera,
@@ -225,9 +226,7 @@ class Backend(ABC, Generic[Projected, Binned]):
         self,
         fwd: Forward,
         parameters: Parameters,
-        d_color: Tensor,
-        d_alpha: Tensor | None = None,
-        d_depth: Tensor | None = None,
+        gradients: ImageGradients,
         *,
         adam: GaussianAdam,
         statistics: tuple[Tensor, Tensor] | None = None,
@@ -244,9 +243,7 @@ class Backend(ABC, Generic[Projected, Binned]):
         """
         checks.check_update(parameters, adam, statistics, len(fwd.radii))
         means, log_scales, quats, opacity_logits, _ = parameters
-        g = self.backward(
-            fwd, d_color, d_alpha, d_depth, colors=colors, camera=camera, sh_adam=adam.sh
-        )
+        g = self.backward(fwd, *gradients, colors=colors, camera=camera, sh_adam=adam.sh)
         if statistics is not None:
             self.observe_gradients(fwd, g, *statistics)
         self.frame_adam(means, quats, log_scales, g.means, g.quats, adam.frames, adam.frame_rates)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -277,6 +277,15 @@ class ShAdam:
     moments: Moments
     last: Tensor
     rates: AdamRates
+
+
+class ImageGradients(NamedTuple):
+    """The gradients of ``Backend.backward`` on the images: (H, W, 3) of the colours, (H, W) of
+    alpha and depth; float32."""
+
+    color: Tensor
+    alpha: Tensor | None = None
+    depth: Tensor | None = None
 
 
 @dataclass(frozen=True)

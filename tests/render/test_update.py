@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.render import GaussianAdam, Moments, RasterOptions
+from pipeline.render import GaussianAdam, ImageGradients, Moments, RasterOptions
 from pipeline.render.backend import Backend
 from tests.render.scenes import camera, random_scene
 from tests.render.updates import made_adam, moments_of
@@ -28,7 +28,7 @@ def updated(
     adam, observed = made_adam(scene), torch.rand(2, count, generator=draws)
     update = backend.update if at_once else lambda *a, **k: Backend.update(backend, *a, **k)
     found = update(
-        fwd, scene, d_color, d_alpha, adam=adam, colors=True, camera=True,
+        fwd, scene, ImageGradients(d_color, d_alpha), adam=adam, colors=True, camera=True,
         statistics=tuple(observed) if statistics else None,
     )  # fmt: skip
     assert found.colors is not None and found.camera is not None
@@ -71,7 +71,8 @@ def wrong(adam: GaussianAdam) -> dict[str, GaussianAdam]:
 
 def test_invalid_arguments_are_errors(backend: Backend) -> None:
     scene, cam = random_scene(5, 9), camera(70, 50)
-    fwd, d_color = backend.forward(*scene, cam, RasterOptions()), torch.zeros(50, 70, 3)
+    fwd = backend.forward(*scene, cam, RasterOptions())
+    d_color = ImageGradients(torch.zeros(50, 70, 3))
     for message, adam in wrong(made_adam(scene)).items():
         with pytest.raises(ValueError, match=message):
             backend.update(fwd, scene, d_color, adam=adam)

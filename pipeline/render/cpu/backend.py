@@ -22,6 +22,7 @@ from pipeline.render.types import (
     FrameMoments,
     GaussianAdam,
     Gradients,
+    ImageGradients,
     LossResult,
     Moments,
     RasterCamera,
@@ -208,9 +209,7 @@ class CpuBackend(Backend[Projected, Binned]):
         self,
         fwd: Forward,
         parameters: Parameters,
-        d_color: Tensor,
-        d_alpha: Tensor | None = None,
-        d_depth: Tensor | None = None,
+        gradients: ImageGradients,
         *,
         adam: GaussianAdam,
         statistics: tuple[Tensor, Tensor] | None = None,
@@ -218,7 +217,7 @@ class CpuBackend(Backend[Projected, Binned]):
         camera: bool = False,
     ) -> ViewGradients:
         s: State = fwd.state
-        p, slot_gradients = s.projected, _slot_gradients(fwd, d_color, d_alpha, d_depth)
+        p, slot_gradients = s.projected, _slot_gradients(fwd, *gradients)
         checks.check_update(parameters, adam, statistics, len(fwd.radii))
         moments = (
             *(adam.frames.means, adam.frames.rotations),

@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from torch import Tensor
-
-from pipeline.render import Backend, Forward, Gradients, RasterOptions, ViewGradients
+from pipeline.render import (
+    Backend,
+    Forward,
+    Gradients,
+    ImageGradients,
+    RasterOptions,
+    ViewGradients,
+)
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.step_view import StepView
 from pipeline.training.few_views import ThinnedOpacities, thinned
@@ -15,7 +20,7 @@ from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.losses.color import ColorLoss
-from pipeline.training.losses.plane import PlaneGradients, add, summed_gradients
+from pipeline.training.losses.plane import add, summed_gradients
 from pipeline.training.run import TrainingRun
 
 
@@ -46,14 +51,9 @@ class OperatorStep(StepEngine):
         color = self.color_loss.gradients(rendered, view)
         self.require_finite(color.loss, view, state.step)
         others = summed_gradients(self.losses, rendered, view, state.step)
-        found = self._update(
-            step,
-            drawn,
-            opacities,
-            rendered,
-            PlaneGradients(add(color.d_alpha, others.alpha), others.depth),
-            color.d_color,
-        )
+        d_alpha = add(color.d_alpha, others.alpha)
+        of_images = ImageGradients(color.d_color, d_alpha, others.depth)
+        found = self._update(step, drawn, opacities, rendered, of_images)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
         self._update_photograph(step, found)
@@ -69,8 +69,7 @@ class OperatorStep(StepEngine):
         drawn: Gaussians,
         opacities: ThinnedOpacities | None,
         rendered: Forward,
-        d_planes: PlaneGradients,
-        d_color: Tensor,
+        of_images: ImageGradients,
     ) -> ViewGradients:
         """Update the Gaussians and the statistics of density control, at once if nothing else needs
         the gradients."""
@@ -78,11 +77,11 @@ class OperatorStep(StepEngine):
         colors, camera = state.appearance is not None, state.cameras.enabled
         if adam is not None and opacities is None and state.density.statistics is not None:
             return self.backend.update(
-                rendered, drawn.parameters(), d_color, *d_planes, adam=adam,
+                rendered, drawn.parameters(), of_images, adam=adam,
                 statistics=state.density.statistics, colors=colors, camera=camera,
             )  # fmt: skip
         gradients = self.backend.backward(
-            rendered, d_color, *d_planes, colors=colors, camera=camera,
+            rendered, *of_images, colors=colors, camera=camera,
             sh_adam=state.adam.harmonics(step.adam),
         )  # fmt: skip
         if opacities is not None:

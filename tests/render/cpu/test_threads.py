@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.render import RasterOptions, make_backend
+from pipeline.render import ImageGradients, RasterOptions, make_backend
 from pipeline.render.types import AdamRates, AlphaChangeLoss, FrameMoments, Moments, ShAdam
 from tests.render.scenes import camera, random_scene, random_surroundings
 from tests.render.updates import made_adam, moments_of
@@ -87,7 +87,14 @@ def every_operator(threads: int) -> dict[str, Tensor]:
 
     parameters = means.clone(), log_scales.clone(), quats.clone(), *(t.clone() for t in scene[3:])
     adam, statistics = made_adam(parameters), torch.zeros(2, COUNT)
-    backend.update(fwd, parameters, loss.grad, adam=adam, statistics=tuple(statistics), colors=True)
+    backend.update(
+        fwd,
+        parameters,
+        ImageGradients(loss.grad),
+        adam=adam,
+        statistics=tuple(statistics),
+        colors=True,
+    )
     changed = (*parameters, statistics, *moments_of(adam))
     found |= {f"updated {k}": tensor for k, tensor in enumerate(changed)}
     return found

@@ -76,11 +76,9 @@ def test_the_gradient_is_that_of_the_loss(
     seen: dict[str, Any] = {}
     update, loss = make_backend().update, make_backend().l1_ssim
 
-    def watched_update(
-        rendered: Any, parameters: Any, d_color: Any, *rest: Any, **named: Any
-    ) -> Any:
-        seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
-        return update(rendered, parameters, d_color, *rest, **named)
+    def watched_update(rendered: Any, parameters: Any, of_images: Any, **named: Any) -> Any:
+        seen["color"], seen["d_color"] = rendered.color.clone(), of_images.color.clone()
+        return update(rendered, parameters, of_images, **named)
 
     def watched_loss(picture: Any, *rest: Any, factor: Any = None) -> Any:
         seen["wanted_and_weights"] = rest

@@ -72,16 +72,8 @@ class Time:
     wall: float = 0.0
     busy: float = 0.0
 
-    @staticmethod
-    def now() -> Time:
-        wall, (loops, threads) = time.perf_counter(), cpu._ops().loop_time()
-        return Time(wall, wall - loops + threads - Pool.loops + Pool.threads)
-
     def __add__(self, other: Time) -> Time:
         return Time(self.wall + other.wall, self.busy + other.busy)
-
-    def __sub__(self, other: Time) -> Time:
-        return Time(self.wall - other.wall, self.busy - other.busy)
 
 
 class Pool(ThreadPoolExecutor):
@@ -118,20 +110,24 @@ class Phases:
 
     def __init__(self) -> None:
         self.times: dict[str, Time] = defaultdict(Time)
-        self._inside = [Time()]
+        self._inside = [0.0]  # Seconds of the phases inside each open one.
+        self._helped = 0.0
 
     def timed(self, phase: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """The same function, measured as this phase."""
+        """The same function, measured as this phase. Loops since the end of another phase are
+        its own: what runs around phases has none."""
 
         def run(*args: Any, **kwargs: Any) -> Any:
-            self._inside.append(Time())
-            start = Time.now()
+            self._inside.append(0.0)
+            start = time.perf_counter()
             try:
                 return call(*args, **kwargs)
             finally:
-                taken = Time.now() - start
-                self.times[phase] += taken - self._inside.pop()
-                self._inside[-1] += taken
+                seconds = time.perf_counter() - start
+                wall = seconds - self._inside.pop()
+                self._inside[-1] += seconds
+                before, self._helped = self._helped, helped_seconds()
+                self.times[phase] += Time(wall, wall + self._helped - before)
 
         return run
 
@@ -139,6 +135,13 @@ class Phases:
         """The times since the last call."""
         taken, self.times = dict(self.times), defaultdict(Time)
         return taken
+
+
+def helped_seconds() -> float:
+    """The time of all threads in loops without that of the loops: what the others do for the first
+    thread, less its waits for them."""
+    loops, threads = cpu._ops().loop_time()
+    return threads - loops + Pool.threads - Pool.loops
 
 
 class Run:

@@ -251,6 +251,21 @@ class Backend(ABC, Generic[Projected, Binned]):
         self.adam_step(opacity_logits, g.opacity_logits, adam.opacity_logits, adam.opacity_rates)
         return ViewGradients(g.colors, g.camera)
 
+    def take_rows(
+        self,
+        tensors: Mapping[str, Tensor],
+        rows: Tensor,
+        zeroed: Tensor | None = None,
+        threads: int = 0,
+    ) -> dict[str, Tensor]:
+        """``tensor[rows]`` of contiguous tensors of as many rows each, of any type, by int64
+        indices (M,); 0 in the rows of the result that ``zeroed`` (M,) bool contains."""
+        taken = {name: tensor[rows] for name, tensor in tensors.items()}
+        for tensor in taken.values():
+            if zeroed is not None:
+                tensor[zeroed] = 0
+        return taken
+
     def forward(
         self,
         means: Tensor,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import chain
 
 import torch
@@ -208,6 +209,22 @@ def check_update(
         if len(rates.rates) != 1 or moments.exp_avg_sq.shape != parameter.shape:
             raise ValueError("update: scales and opacities have one rate and moments of their own")
     check_sh_adam(adam.sh, sh)
+
+
+def check_rows(tensors: Sequence[Tensor], rows: Tensor, zeroed: Tensor | None) -> None:
+    """Raise ValueError if the arguments of ``take_rows`` do not fit, and IndexError if an
+    index is out of range."""
+    counts = {len(tensor) for tensor in tensors}
+    if len(counts) > 1 or not all(t.is_contiguous() and t.is_cpu for t in tensors):
+        raise ValueError("take_rows: tensors must be contiguous and have as many rows each")
+    if rows.dtype != torch.int64 or rows.dim() != 1 or not rows.is_contiguous():
+        raise ValueError(f"take_rows: rows must be int64 (M,), found {rows.dtype}")
+    if zeroed is not None and (zeroed.dtype != torch.bool or zeroed.shape != rows.shape):
+        raise ValueError("take_rows: zeroed must be bool, one for each of the rows")
+    if zeroed is not None and not zeroed.is_contiguous():
+        raise ValueError("take_rows: zeroed must be contiguous")
+    if tensors and len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(tensors[0]):
+        raise IndexError("take_rows: a row is out of range")
 
 
 def _check_rates(operator: str, rates: AdamRates, count: int | None = None) -> None:

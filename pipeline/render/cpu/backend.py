@@ -291,6 +291,18 @@ class CpuBackend(Backend[Projected, Binned]):
         tensors = means2d, rendered.radii, gradient_sum, seen
         _ops().observe_gradients(*tensors, 0.5 * width, 0.5 * height, _threads(threads))
 
+    def take_rows(
+        self,
+        tensors: Mapping[str, Tensor],
+        rows: Tensor,
+        zeroed: Tensor | None = None,
+        threads: int = 0,
+    ) -> dict[str, Tensor]:
+        sources = [tensor.detach() for tensor in tensors.values()]
+        checks.check_rows(sources, rows, zeroed)
+        taken = _ops().take_rows(sources, rows, zeroed, _threads(threads))
+        return dict(zip(tensors, taken, strict=True))
+
     def adam_step(
         self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:

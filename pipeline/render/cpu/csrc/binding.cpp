@@ -15,6 +15,7 @@
 #include "loss.h"
 #include "memory.h"
 #include "project.h"
+#include "rows.h"
 #include "step.h"
 #include "surroundings.h"
 #include "threads.h"
@@ -31,14 +32,17 @@ const float* floats(const OptionalTensor& t) { return t ? floats(*t) : nullptr; 
 float* mutable_floats(const Tensor& t) { return t.mutable_data_ptr<float>(); }
 
 // An uninitialised tensor in memory that is reused.
-template <class T>
-Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type) {
+Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type, size_t element_size) {
     std::vector<int64_t> strides(shape.size());
     int64_t count = 1;
     for (size_t i = shape.size(); i-- > 0; count *= shape[i]) strides[i] = count;
-    return torch::stable::from_blob(splat::take_memory(size_t(count) * sizeof(T)), shape, strides,
-                                    {torch::headeronly::DeviceType::CPU}, type,
+    return torch::stable::from_blob(splat::take_memory(size_t(count) * element_size), shape,
+                                    strides, {torch::headeronly::DeviceType::CPU}, type,
                                     splat::give_back_memory);
+}
+template <class T>
+Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type) {
+    return new_tensor(shape, type, sizeof(T));
 }
 Tensor new_floats(const std::vector<int64_t>& shape) {
     return new_tensor<float>(shape, ScalarType::Float);
@@ -330,6 +334,25 @@ void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scal
                       means.size(0), settings_from(adam), int(threads));
 }
 
+// Rows of each tensor, see rows.h.
+std::vector<Tensor> take_rows(std::vector<Tensor> tensors, const Tensor& rows,
+                              OptionalTensor zeroed, int64_t threads) {
+    std::vector<Tensor> taken;
+    std::vector<splat::RowCopy> copies;
+    for (const Tensor& t : tensors) {
+        const auto bytes = int64_t(t.element_size());
+        int64_t width = 1;
+        std::vector<int64_t> shape = {rows.numel()};
+        for (int64_t k = 1; k < t.dim(); k++) width *= t.size(k), shape.push_back(t.size(k));
+        taken.push_back(new_tensor(shape, t.scalar_type(), size_t(bytes)));
+        copies.push_back({static_cast<const char*>(t.const_data_ptr()),
+                          static_cast<char*>(taken.back().mutable_data_ptr()), width * bytes});
+    }
+    splat::take_rows(copies, rows.const_data_ptr<int64_t>(),
+                     zeroed ? zeroed->const_data_ptr<bool>() : nullptr, rows.numel(), int(threads));
+    return taken;
+}
+
 std::tuple<double, double> loop_time() {
     const splat::LoopTime time = splat::loop_time();
     return {time.loops, time.threads};
@@ -386,6 +409,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "frame_adam(Tensor(a!) means, Tensor(b!) quats, Tensor log_scales, Tensor d_means, "
         "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) rotation_avg, "
         "Tensor(f!) rotation_avg_sq, Tensor adam, int threads) -> ()");
+    m.def("take_rows(Tensor[] tensors, Tensor rows, Tensor? zeroed, int threads) -> Tensor[]");
     m.def("release_memory() -> ()");
     m.def("save_memory(bool little) -> ()");
     m.def("loop_time() -> (float, float)");
@@ -405,6 +429,7 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("observe_gradients", TORCH_BOX(&observe_gradients));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
+    m.impl("take_rows", TORCH_BOX(&take_rows));
 }
 
 // They have no tensor that chooses a device.

@@ -81,7 +81,7 @@ class Trained:
             taken = self._taken(name, order, len(rows), tensors)
             self._replace(name, taken)
             self.sections[name] = layout.words(tensors)
-            self.gpu.read(taken, np.uint32, 1)  # Waits: one array at a time is there twice.
+            self.gpu.read(order, np.uint32, 1)  # Waits: one array at a time is there twice.
         self.count = len(rows)
 
     def bad_colors(self) -> Tensor:

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from pipeline.render.checks import Parameters
 from pipeline.render.types import (
     AdamRates,
     AlphaChangeLoss,
@@ -178,6 +179,11 @@ class ResidentTraining(ABC):
             row: One Gaussian. Rows have its shapes: they get zeros at the end if they were
                 shorter.
         """
+
+    @abstractmethod
+    def lend(self, parameters: Parameters) -> None:
+        """Let the backend's operators render the device's Gaussians for these tensors, whose values
+        need not be current, until the next step or change."""
 
     @abstractmethod
     def bad_colors(self) -> Tensor:

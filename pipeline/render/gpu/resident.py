@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.render.checks import Parameters
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_step, update_gaussians
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
@@ -24,6 +25,7 @@ from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, uplo
 from pipeline.render.gpu.memory import PAIRS_PER_GAUSSIAN, memory_line
 from pipeline.render.gpu.primitives import add_partial_sums, partial_sums, sum_blocks
 from pipeline.render.gpu.rasterise import Totals
+from pipeline.render.gpu.scene_cache import SceneCache
 from pipeline.render.gpu.trained import Trained
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
@@ -119,10 +121,15 @@ class _Planes:
 
 
 class GpuTraining(ResidentTraining):
-    """See ``ResidentTraining``."""
+    """See ``ResidentTraining``.
 
-    def __init__(self, gpu: Gpu):
+    Args:
+        scenes: The scene that the backend's operators render.
+    """
+
+    def __init__(self, gpu: Gpu, scenes: SceneCache):
         self.gpu, self.space, self.images = gpu, Workspace(gpu), _Images(gpu)
+        self.scenes = scenes
         self.trained = Trained(self.space)
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.stopped = gpu.empty(4, what="stopped")
@@ -134,6 +141,10 @@ class GpuTraining(ResidentTraining):
 
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
+
+    def lend(self, parameters: Parameters) -> None:
+        self._read_results()
+        self.scenes.put(parameters, self.scene)
 
     def load(self, optimised: Optimised, part: Part = Part.ALL) -> None:
         self._read_results()
@@ -159,6 +170,7 @@ class GpuTraining(ResidentTraining):
 
     def _set_scene(self) -> None:
         """Render the Gaussians that ``trained`` has, with room for their pairs."""
+        self.scenes.clear()
         before, self.scene = self.scene.count, self.trained.scene
         count = self.scene.count
         if not self._pairs:
@@ -167,6 +179,7 @@ class GpuTraining(ResidentTraining):
             self._set_capacity(max(self._pairs), self._capacity * count // max(before, 1))
 
     def step(self, step: ResidentStep) -> None:
+        self.scenes.clear()
         if self._recorded:
             end = self._recorded[-1].end + sum(self._sizes(step).values())
             if end > RESULT_WORDS or len(self._recorded) == MAX_RECORDED:

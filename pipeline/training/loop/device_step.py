@@ -122,6 +122,9 @@ class DeviceStep(StepEngine):
             self.training.store(self._optimised(), part)
             self._current = part
 
+    def lend(self) -> None:
+        self.training.lend(self.state.gaussians.parameters())
+
     def bad_colors(self) -> Tensor:
         return self.training.bad_colors()
 

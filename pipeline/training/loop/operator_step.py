@@ -104,6 +104,9 @@ class OperatorStep(StepEngine):
     def fetch(self, part: Part = Part.ALL) -> None:
         """The tensors of the state are always current."""
 
+    def lend(self) -> None:
+        """The backend renders the tensors of the state."""
+
     def bad_colors(self) -> Tensor:
         return not_finite(self.state.gaussians.colors(), self.run.threads)
 

@@ -88,6 +88,11 @@ class StepEngine(ABC):
         ``results``, as the methods below."""
 
     @abstractmethod
+    def lend(self) -> None:
+        """Let the backend render the Gaussians of ``state`` until they change, though only
+        ``Part.GEOMETRY`` was fetched."""
+
+    @abstractmethod
     def bad_colors(self) -> Tensor:
         """(N,) bool, the Gaussians with colours that are not finite."""
 

@@ -154,7 +154,7 @@ class Trainer:
         transients_due = state.transients is not None and state.transients.is_due(steps, run_length)
         if not floaters_due and not transients_due and not state.density.is_due(steps):
             return
-        self.fetch(Part.PARAMETERS if transients_due else Part.GEOMETRY)
+        self.fetch(Part.GEOMETRY)
         faded = self.fade_ghosts() if transients_due else 0
         faded += self.fade_floaters() if floaters_due else 0
         if self.run.is_part:
@@ -198,6 +198,10 @@ class Trainer:
         number."""
         state = self.state
         assert state.transients is not None
+        if state.appearance is None:
+            self.engine.lend()
+        else:  # The colours in each photograph are computed here.
+            self.engine.fetch(Part.PARAMETERS)
         ghosts = state.transients.search(self.reduced_photographs())
         state.gaussians.opacity_logits[ghosts] = FADED_LOGIT
         found = int(ghosts.sum())

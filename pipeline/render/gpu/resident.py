@@ -144,7 +144,7 @@ class GpuTraining(ResidentTraining):
 
     def lend(self, parameters: Parameters) -> None:
         self._read_results()
-        self.scenes.put(parameters, self.scene)
+        self.scenes.lend(parameters, self.scene)
 
     def load(self, optimised: Optimised, part: Part = Part.ALL) -> None:
         self._read_results()
@@ -170,7 +170,7 @@ class GpuTraining(ResidentTraining):
 
     def _set_scene(self) -> None:
         """Render the Gaussians that ``trained`` has, with room for their pairs."""
-        self.scenes.clear()
+        self.scenes.take_back()
         before, self.scene = self.scene.count, self.trained.scene
         count = self.scene.count
         if not self._pairs:
@@ -179,7 +179,7 @@ class GpuTraining(ResidentTraining):
             self._set_capacity(max(self._pairs), self._capacity * count // max(before, 1))
 
     def step(self, step: ResidentStep) -> None:
-        self.scenes.clear()
+        self.scenes.take_back()
         if self._recorded:
             end = self._recorded[-1].end + sum(self._sizes(step).values())
             if end > RESULT_WORDS or len(self._recorded) == MAX_RECORDED:

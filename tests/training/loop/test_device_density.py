@@ -3,6 +3,7 @@ few bytes between the two."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,12 @@ from pipeline.render.gpu.counts import Counts
 from pipeline.render.gpu.device import Gpu
 from pipeline.render.resident import Optimised, Part
 from pipeline.scene.views import View
+from pipeline.splats import rows
 from pipeline.splats.gaussians import Geometry
 from pipeline.splats.skybox import FILL_OPACITY
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density import Update, floaters
-from pipeline.training.loop import session
+from pipeline.training.loop import device_step, session
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.train import train
 from pipeline.training.loop.trainer import Trainer
@@ -72,10 +74,19 @@ class Device:
         return self.arrays
 
 
+def wrong_rows(tensors: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+    """Tensors without values, which nobody may read before they are fetched."""
+    found = rows.new_rows(tensors, count)
+    for tensor in found.values():
+        tensor.fill_(math.nan if tensor.is_floating_point() else -1)
+    return found
+
+
 @pytest.fixture(params=[True, False], ids=["subgroups", "without"])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Device:
     need_gpu()
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(device_step, "new_rows", wrong_rows)
     return Device(monkeypatch, request.param)
 
 

@@ -126,7 +126,6 @@ def _arrays(optimised: Optimised, after: Part, up_to: Part) -> dict[str, Mapping
     parameters, first, second = optimised.parameters, optimised.first, optimised.second
     found: dict[str, Mapping[str, Tensor]] = {
         "geometry": {name: parameters[name] for name in layout.GEOMETRY},
-        "sh": {"sh": parameters["sh"]},
         "moments": layout.moments(first, second),
         "first sh": {"sh": first["sh"]},
         "second sh": {"sh": second["sh"]},
@@ -136,4 +135,5 @@ def _arrays(optimised: Optimised, after: Part, up_to: Part) -> dict[str, Mapping
     if (appearance := parameters.get("appearance")) is not None:
         moments = {"first": first["appearance"], "second": second["appearance"]}
         found |= {"appearance": {"": appearance}, "moments of the appearance": moments}
+    found["sh"] = {"sh": parameters["sh"]}  # The last: the old scene keeps it while rows are taken.
     return {k: v for k, v in found.items() if after < PARTS.get(k, Part.ALL) <= up_to}

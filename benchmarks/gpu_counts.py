@@ -55,7 +55,7 @@ def measure(scene: Scene, backend: GpuBackend, steps: int) -> tuple[GpuCountsRes
         dispatches=counts.dispatches,
         copies=counts.copies,
         submissions=counts.submissions,
-        uploaded_mb=counts.uploaded / 1e6,
+        uploaded_mb=counts.uploaded.total() / 1e6,
         memory_mb={name: size / 1e6 for name, size in both.most_common()},
         gflop=1e-9
         * (

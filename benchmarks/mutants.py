@@ -190,6 +190,20 @@ MUTANTS: dict[str, Mutant] = {
         "a scene as large as its cameras stand apart",
         ("tests/training/test_scene.py",),
     ),
+    "reset_not_loaded": Mutant(
+        "pipeline/training/loop/device_step.py",
+        'self.training.load_moments(self._optimised(), "opacity_logits")',
+        "pass",
+        "moments of opacities that the device keeps after a reset",
+        ("tests/training/loop/test_device_density.py",),
+    ),
+    "moments_of_new_rows": Mutant(
+        "pipeline/render/gpu/wgsl/take_rows.wgsl",
+        "size.blanks != 0u && (row & kBlank) != 0u",
+        "false",
+        "new Gaussians with the moments of those that they were split from, on a device",
+        ("tests/render/test_trained.py",),
+    ),
     "late_reset": Mutant(
         "pipeline/training/density/gradient.py",
         "step + interval <= self.timeline.stop",

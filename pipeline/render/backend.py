@@ -34,6 +34,7 @@ from pipeline.render.types import (
     Surroundings,
     ViewGradients,
 )
+from pipeline.splats.rows import take_rows
 
 
 class Projection(Protocol):
@@ -260,11 +261,7 @@ class Backend(ABC, Generic[Projected, Binned]):
     ) -> dict[str, Tensor]:
         """``tensor[rows]`` of contiguous tensors of as many rows each, of any type, by int64
         indices (M,); 0 in the rows of the result that ``zeroed`` (M,) bool contains."""
-        taken = {name: tensor[rows] for name, tensor in tensors.items()}
-        for tensor in taken.values():
-            if zeroed is not None:
-                tensor[zeroed] = 0
-        return taken
+        return take_rows(tensors, rows, threads, zeroed)
 
     def forward(
         self,

@@ -5,10 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Protocol
 
 from torch import Tensor
 
+from pipeline.render.checks import Parameters
 from pipeline.render.types import (
     AdamRates,
     AlphaChangeLoss,
@@ -54,6 +56,21 @@ class Optimised:
     last: Tensor
     gradient_sum: Tensor
     seen: Tensor
+
+
+class Part(IntEnum):
+    """A part of ``Optimised``, which contains the parts before.
+
+    Attributes:
+        GEOMETRY: All parameters but the colours, and the statistics of density control.
+        PARAMETERS: The colours, and ``last``.
+        ALL: Adam's moments.
+    """
+
+    NOTHING = 0
+    GEOMETRY = 1
+    PARAMETERS = 2
+    ALL = 3
 
 
 @dataclass(frozen=True)
@@ -144,8 +161,33 @@ class ResidentTraining(ABC):
         """
 
     @abstractmethod
-    def load(self, optimised: Optimised) -> None:
-        """Copy the tensors to the device."""
+    def load(self, optimised: Optimised, part: Part = Part.ALL) -> None:
+        """Copy a part of the tensors to the device."""
+
+    @abstractmethod
+    def load_moments(self, optimised: Optimised, name: str) -> None:
+        """Copy the moments of one of the parameters of the geometry to the device."""
+
+    @abstractmethod
+    def select(self, rows: Tensor, blank: Tensor, row: Optimised) -> None:
+        """Replace colours, moments and ``last`` by copies of their rows, in the device's memory.
+        If the number of Gaussians changes, ``Part.GEOMETRY`` has to be loaded afterwards.
+
+        Args:
+            rows: (M,) int64, the row that each Gaussian is copied from.
+            blank: (M,) bool, the Gaussians that get the moments of ``row`` instead.
+            row: One Gaussian. Rows have its shapes: they get zeros at the end if they were
+                shorter.
+        """
+
+    @abstractmethod
+    def lend(self, parameters: Parameters) -> None:
+        """Let the backend's operators render the device's Gaussians for these tensors, whose values
+        need not be current, until the next step or change."""
+
+    @abstractmethod
+    def bad_colors(self) -> Tensor:
+        """(N,) bool, the Gaussians with colours that are not finite; waits for the steps."""
 
     @abstractmethod
     def step(self, step: ResidentStep) -> None:
@@ -164,5 +206,5 @@ class ResidentTraining(ABC):
         """
 
     @abstractmethod
-    def store(self, optimised: Optimised) -> None:
-        """Copy the tensors back, in place. The copies on the device stay valid."""
+    def store(self, optimised: Optimised, part: Part = Part.ALL) -> None:
+        """Copy a part of the tensors back, in place. The copies on the device stay valid."""

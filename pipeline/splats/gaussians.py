@@ -16,6 +16,29 @@ from pipeline.splats.rows import take_rows
 if TYPE_CHECKING:
     from torch import Tensor
 
+COLORS = "sh", "appearance"
+
+
+@dataclass
+class Geometry:
+    """All parameters of N Gaussians but their colours, see ``Gaussians``."""
+
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    opacity_logits: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name, in the order of the fields. They are not copied."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def select(self, rows: Tensor, threads: int = 1) -> Geometry:
+        """Copies of the rows of int64 indices (M,)."""
+        return Geometry(**take_rows(self.tensors(), rows, threads))
+
 
 @dataclass
 class Gaussians:
@@ -62,6 +85,15 @@ class Gaussians:
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The rasterizer's first arguments, in order."""
         return self.means, self.log_scales, self.quats, self.opacity_logits, self.sh
+
+    @property
+    def geometry(self) -> Geometry:
+        """The parameters but the colours. They are not copied."""
+        return Geometry(self.means, self.log_scales, self.quats, self.opacity_logits)
+
+    def colors(self) -> dict[str, Tensor]:
+        """The tensors by name that ``geometry`` does not have. They are not copied."""
+        return {name: tensor for name, tensor in self.tensors().items() if name in COLORS}
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The tensors as numpy arrays that share their memory."""

@@ -37,7 +37,7 @@ def take_rows(
     result that ``zeroed`` (M,) bool contains."""
     import torch
 
-    taken = {name: _new_rows(tensor, len(rows)) for name, tensor in tensors.items()}
+    taken = new_rows(tensors, len(rows))
 
     def take(part: slice) -> None:
         empty = None if zeroed is None else torch.nonzero(zeroed[part])[:, 0]
@@ -49,6 +49,11 @@ def take_rows(
 
     for_ranges(len(rows), threads, take)
     return taken
+
+
+def new_rows(tensors: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
+    """Tensors of ``count`` rows like those of ``tensors``, not initialised."""
+    return {name: _new_rows(tensor, count) for name, tensor in tensors.items()}
 
 
 def _new_rows(tensor: Tensor, count: int) -> Tensor:

@@ -18,6 +18,7 @@ from pipeline.render.gpu.device import Buffer, Gpu
 from pipeline.render.gpu.loss import LossImage, compose, l1_ssim, upload_layers
 from pipeline.render.gpu.primitives import sum_rows
 from pipeline.render.gpu.resident import GpuTraining
+from pipeline.render.gpu.scene_cache import SceneCache
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import (
     AdamRates,
@@ -76,7 +77,7 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def __init__(self, number: int = 0):
         self.number = number
-        self._last: tuple[object, rasterise.Scene, Parameters] | None = None
+        self.scenes = SceneCache()
 
     @cached_property
     def gpu(self) -> Gpu:
@@ -87,12 +88,12 @@ class GpuBackend(Backend[Projected, Binned]):
         return {"instruction_set": str(adapter), "compiler": adapter.driver}
 
     def resident(self) -> GpuTraining:
-        return GpuTraining(self.gpu)
+        return GpuTraining(self.gpu, self.scenes)
 
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
-        gpu, scene = self.gpu, self._scene(parameters)
+        gpu, scene = self.gpu, self.scenes.get(self.gpu, parameters)
         view = gpu.upload(layout.pack_view(camera, options, scene.count, scene.coefficients))
         size = camera.width, camera.height
         projection = rasterise.project(Workspace(gpu), scene, view, size)
@@ -272,22 +273,6 @@ class GpuBackend(Backend[Projected, Binned]):
         adam.frame_adam(Workspace(gpu), rates, count, **buffers)
         for name in ("geometry", "moments"):
             layout.fetch(gpu, buffers[name], *tensors[name])
-
-    def _scene(self, parameters: Parameters) -> rasterise.Scene:
-        """The parameters on the device. Those of the last call are copied once: usually, a scene is
-        rendered from many views."""
-        key = tuple((p.data_ptr(), p._version, p.shape) for p in parameters)
-        if self._last is None or self._last[0] != key:
-            count, sh = len(parameters[0]), parameters[4]
-            scene = rasterise.Scene(
-                count,
-                sh.shape[1],
-                self.gpu.upload(layout.join(parameters[:4]), what=f"{count} Gaussians"),
-                self.gpu.upload(sh.numpy(), what="the SH coefficients"),
-            )
-            # The tensors are kept, so that others cannot get their addresses.
-            self._last = key, scene, parameters
-        return self._last[1]
 
     def _composition(
         self,

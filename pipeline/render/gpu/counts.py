@@ -63,7 +63,7 @@ class Counts:
         dispatches: The number of dispatched kernels.
         copies: The number of copies and clears of buffers, which interrupt a pass.
         submissions: The number of submitted command buffers.
-        uploaded, downloaded: Bytes copied to the device and from it.
+        uploaded, downloaded: Bytes copied to the device and from it, by the names of the buffers.
         pairs: The number of (Gaussian, tile) pairs of the last step whose results were read; None:
             it is not known, and arrays of pairs count with all their room.
         traffic: None: it is not counted, which takes time.
@@ -73,8 +73,8 @@ class Counts:
     dispatches: int = 0
     copies: int = 0
     submissions: int = 0
-    uploaded: int = 0
-    downloaded: int = 0
+    uploaded: Counter[str] = field(default_factory=Counter)
+    downloaded: Counter[str] = field(default_factory=Counter)
     pairs: int | None = None
     traffic: Traffic | None = None
 

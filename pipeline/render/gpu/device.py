@@ -195,7 +195,7 @@ class Gpu:
         if data.nbytes % 4:
             data = np.concatenate([data, np.zeros(-data.nbytes % 4, np.uint8)])
         if data.nbytes:
-            self.counts.uploaded += data.nbytes
+            self.counts.uploaded[buffer.label] += data.nbytes
             self.device.queue.write_buffer(buffer, offset, data)
 
     def copy(self, source: Buffer, start: int, target: Buffer, offset: int, size: int) -> None:
@@ -215,7 +215,7 @@ class Gpu:
         if not size:
             return np.zeros(0, dtype)
         self.counts.waits += 1
-        self.counts.downloaded += size
+        self.counts.downloaded[buffer.label] += size
         try:
             data = self.device.queue.read_buffer(buffer, offset, (size + 3) // 4 * 4)
         except Exception as error:

@@ -58,9 +58,12 @@ def moments(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> Tensor
     return found
 
 
-def widths(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """The sections of an array of tensors (N, ...)."""
-    return {name: math.prod(tensor.shape[1:]) for name, tensor in tensors.items()}
+def words(tensors: Mapping[str, Tensor]) -> dict[str, int]:
+    """The sections of an array of tensors (N, ...) of any type, in words."""
+    return {
+        name: math.prod(tensor.shape[1:]) * tensor.element_size() // 4
+        for name, tensor in tensors.items()
+    }
 
 
 def floats(sections: Mapping[str, int]) -> int:

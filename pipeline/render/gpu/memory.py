@@ -36,8 +36,9 @@ def training_bytes(size: TrainingSize, cached: int) -> int:
     parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
     per_gaussian = layout.RECORD_BYTES + GAUSSIAN_BYTES
     per_gaussian += PAIRS_PER_GAUSSIAN * PAIR_BYTES
-    # Parameters with two moments; those of SH are among the large arrays once.
-    moments = 3 * parameters - 12 * size.sh_coefficients
+    # Parameters with two moments. Those of SH are among the large arrays once, and once more while
+    # their rows are selected.
+    moments = 3 * parameters
     return (
         sum(large_arrays(size).values())
         + (moments + per_gaussian) * size.gaussians

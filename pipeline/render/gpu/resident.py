@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.render.checks import Parameters
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_step, update_gaussians
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
@@ -24,9 +25,12 @@ from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, uplo
 from pipeline.render.gpu.memory import PAIRS_PER_GAUSSIAN, memory_line
 from pipeline.render.gpu.primitives import add_partial_sums, partial_sums, sum_blocks
 from pipeline.render.gpu.rasterise import Totals
+from pipeline.render.gpu.scene_cache import SceneCache
+from pipeline.render.gpu.trained import Trained
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
     Optimised,
+    Part,
     ResidentImage,
     ResidentStep,
     ResidentTraining,
@@ -117,14 +121,17 @@ class _Planes:
 
 
 class GpuTraining(ResidentTraining):
-    """See ``ResidentTraining``."""
+    """See ``ResidentTraining``.
 
-    def __init__(self, gpu: Gpu):
+    Args:
+        scenes: The scene that the backend's operators render.
+    """
+
+    def __init__(self, gpu: Gpu, scenes: SceneCache):
         self.gpu, self.space, self.images = gpu, Workspace(gpu), _Images(gpu)
+        self.scenes = scenes
+        self.trained = Trained(self.space)
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
-        self.buffers: dict[str, Buffer] = {}
-        self.moments_at: dict[str, tuple[int, int]] = {}  # The sections of ``moments``.
-        self.embedding_size = 0
         self.stopped = gpu.empty(4, what="stopped")
         self._recorded: list[_Recorded] = []
         self._results: list[StepResult] = []
@@ -135,31 +142,44 @@ class GpuTraining(ResidentTraining):
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
 
-    def load(self, optimised: Optimised) -> None:
+    def lend(self, parameters: Parameters) -> None:
         self._read_results()
-        count, before = len(optimised.last), self.scene.count
-        arrays = _arrays(optimised)
-        self.buffers = {
-            name: self._fill(name, layout.join(tensors.values()))
-            for name, tensors in arrays.items()
-        }
-        self.moments_at = layout.offsets(layout.widths(arrays["moments"]), count)
-        coefficients = optimised.parameters["sh"].shape[1]
-        geometry, sh = self.buffers["geometry"], self.buffers["sh"]
-        self.scene = rasterise.Scene(count, coefficients, geometry, sh)
+        self.scenes.lend(parameters, self.scene)
+
+    def load(self, optimised: Optimised, part: Part = Part.ALL) -> None:
+        self._read_results()
+        self.trained.load(optimised, part)
+        self._set_scene()
+
+    def load_moments(self, optimised: Optimised, name: str) -> None:
+        self._read_results()
+        self.trained.load_moments(optimised, name)
+
+    def select(self, rows: Tensor, blank: Tensor, row: Optimised) -> None:
+        self._read_results()
+        self.trained.select(rows, blank, row)
+        self._set_scene()
+
+    def bad_colors(self) -> Tensor:
+        self._read_results()
+        return self.trained.bad_colors()
+
+    def store(self, optimised: Optimised, part: Part = Part.ALL) -> None:
+        self._read_results()
+        self.trained.store(optimised, part)
+
+    def _set_scene(self) -> None:
+        """Render the Gaussians that ``trained`` has, with room for their pairs."""
+        self.scenes.take_back()
+        before, self.scene = self.scene.count, self.trained.scene
+        count = self.scene.count
         if not self._pairs:
             self._set_capacity(0, PAIRS_PER_GAUSSIAN * count)
         elif count > before:
             self._set_capacity(max(self._pairs), self._capacity * count // max(before, 1))
-        appearance = optimised.parameters.get("appearance")
-        self.embedding_size = 0 if appearance is None else appearance.shape[1]
-
-    def store(self, optimised: Optimised) -> None:
-        self._read_results()
-        for name, tensors in _arrays(optimised).items():
-            layout.fetch(self.gpu, self.buffers[name], *tensors.values())
 
     def step(self, step: ResidentStep) -> None:
+        self.scenes.take_back()
         if self._recorded:
             end = self._recorded[-1].end + sum(self._sizes(step).values())
             if end > RESULT_WORDS or len(self._recorded) == MAX_RECORDED:
@@ -207,7 +227,8 @@ class GpuTraining(ResidentTraining):
             space.run("appearance.hide", blocks(scene.count), **appearance)
             space.run("appearance.gradient", blocks(scene.count), **appearance)
             rows = appearance["d_weights"]
-            sum_blocks(space, rows, scene.count, self.embedding_size, results, at["embedding"])
+            width = self.trained.embedding_size
+            sum_blocks(space, rows, scene.count, width, results, at["embedding"])
         self._update_others(step)
         gpu.submit()
         self._recorded.append(_Recorded(step, loss, at, end))
@@ -281,11 +302,6 @@ class GpuTraining(ResidentTraining):
             embedding=embedding,
         )
 
-    def _fill(self, name: str, array: np.ndarray) -> Buffer:
-        buffer = self.space.get(name, array.nbytes)
-        self.gpu.write(buffer, array)
-        return buffer
-
     def _loss(
         self, step: ResidentStep, target: _Image, image: rasterise.Image
     ) -> tuple[Buffer, Buffer | None, LossSums]:
@@ -341,7 +357,7 @@ class GpuTraining(ResidentTraining):
         return {
             "appearance": space.uniform("sizes of the appearance", "IIII", *sizes),
             "weights": space.write_uniform("embedding", weights.tobytes()),
-            "values": self.buffers["appearance"],
+            "values": self.trained.buffers["appearance"],
             "sh": scene.sh,
             "colours": space.get("colours", 24 * scene.count),
             "gradients": self._gradients(step),
@@ -365,7 +381,7 @@ class GpuTraining(ResidentTraining):
     def _update(self, step: ResidentStep, lists: rasterise.Lists, slots: Buffer) -> None:
         """Update all parameters of Gaussians, but means and rotations that move along the world's
         axes, and the statistics."""
-        buffers, sections = self.buffers, self._sections(step)
+        buffers, sections = self.trained.buffers, self._sections(step)
         gradients = {"gradients": self._gradients(step)} if sections else {}
         update_gaussians(
             self.space,
@@ -386,9 +402,10 @@ class GpuTraining(ResidentTraining):
 
     def _update_others(self, step: ResidentStep) -> None:
         """Update the parameters that ``_update`` does not."""
-        space, count, rates, buffers = self.space, self.scene.count, step.adam, self.buffers
+        space, count, rates = self.space, self.scene.count, step.adam
+        buffers = self.trained.buffers
         if "appearance" in buffers:
-            width = 3 * self.embedding_size
+            width = 3 * self.trained.embedding_size
             adam_step(
                 space, "appearance", rates["appearance"], (count, width), shared=False,
                 gradient=space.get("gradients of the appearance", 4 * width * count),
@@ -402,25 +419,7 @@ class GpuTraining(ResidentTraining):
                 adam_step(
                     space, name, rates[name], (count, layout.GEOMETRY[name]), shared=True,
                     at=at[name][0], gradient_at=gradients_at[name][0],
-                    moments_at=self.moments_at[f"first {name}"][0],
+                    moments_at=self.trained.moments_at(f"first {name}"),
                     gradient=self._gradients(step), parameter=buffers["geometry"],
                     moments=buffers["moments"], stopped=self.stopped,
                 )  # fmt: skip
-
-
-def _arrays(optimised: Optimised) -> dict[str, Mapping[str, Tensor]]:
-    """The tensors that lie one after another in each buffer, by the names of the buffers."""
-    parameters, first, second = optimised.parameters, optimised.first, optimised.second
-    found: dict[str, Mapping[str, Tensor]] = {
-        "geometry": {name: parameters[name] for name in layout.GEOMETRY},
-        "sh": {"sh": parameters["sh"]},
-        "moments": layout.moments(first, second),
-        "first sh": {"sh": first["sh"]},
-        "second sh": {"sh": second["sh"]},
-        "last": {"last": optimised.last},
-        "statistics": {name: vars(optimised)[name] for name in layout.STATISTICS},
-    }
-    if (appearance := parameters.get("appearance")) is not None:
-        moments = {"first": first["appearance"], "second": second["appearance"]}
-        found |= {"appearance": {"": appearance}, "moments of the appearance": moments}
-    return found

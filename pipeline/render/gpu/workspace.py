@@ -34,9 +34,13 @@ class Workspace:
         found = self._buffers.get(name)
         if found is None or found.size < size:
             grown = size if found is None else min(int(GROWTH * size), self.gpu.max_bytes)
-            self._groups.clear()  # They hold the old buffer.
+            self.release_groups()
             found = self._buffers[name] = self.gpu.empty(max(size, grown), what=name)
         return found
+
+    def release_groups(self) -> None:
+        """Make all bind groups anew: they hold a buffer that was replaced."""
+        self._groups.clear()
 
     def uniform(self, name: str, format: str, *values: float) -> Buffer:
         """The buffer of this name with the fields of a struct, whose types are as in the module

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.experiments import GradientExperiments
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Geometry
 from pipeline.splats.skybox import Sky
 from pipeline.training.density.growth import (
     GradientStatistics,
@@ -28,10 +28,9 @@ from pipeline.training.density.strategy import (
     Refinement,
     Strategy,
     highest,
-    not_finite,
+    useless_values,
 )
 from pipeline.training.density.timeline import Timeline, shrunk
-from pipeline.training.optimisers.adam import Adam
 
 # Only Gaussians below this opacity are recycled, and only those among this share with the smallest
 # gradients: new Gaussians are transparent as well, but have large gradients.
@@ -88,7 +87,7 @@ class GradientDensity(Strategy):
         split = torch.zeros_like(kept)
         if self.densifies_after(step.steps):
             gradient = self.observed.mean()
-            candidates = kept & (gradient > self.options.grad_threshold) & ~step.adam.frozen
+            candidates = kept & (gradient > self.options.grad_threshold) & ~step.frozen
             kept = kept & ~self._recycled(step, kept, gradient, candidates)
             # Each split adds one Gaussian.
             split = highest(gradient, candidates & kept, max(0, step.budget - int(kept.sum())))
@@ -97,8 +96,8 @@ class GradientDensity(Strategy):
         self.start(len(refinement.rows))
         return refinement
 
-    def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        limit_opacity(gaussians, adam, unlimited=self._sky(gaussians, adam))
+    def reset_opacity(self, geometry: Geometry, frozen: Tensor) -> None:
+        limit_opacity(geometry, unlimited=self._sky(geometry, frozen))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         return self.observed.arrays()
@@ -108,17 +107,17 @@ class GradientDensity(Strategy):
 
     def _useless(self, step: DensityStep) -> Tensor:
         """(N,) bool: too transparent, too large, or not finite."""
-        gaussians = step.gaussians
-        useless = torch.sigmoid(gaussians.opacity_logits) < self.options.prune_opacity
+        geometry = step.geometry
+        useless = torch.sigmoid(geometry.opacity_logits) < self.options.prune_opacity
         if any(map(self.prunes_large_after, step.steps)):
-            large = longest_scale(gaussians) > self.options.prune_scale * self.scale
-            useless |= large & ~self._sky(gaussians, step.adam)
-        return useless | not_finite(gaussians, step.threads)
+            large = longest_scale(geometry) > self.options.prune_scale * self.scale
+            useless |= large & ~self._sky(geometry, step.frozen)
+        return useless | useless_values(step)
 
-    def _sky(self, gaussians: Gaussians, adam: Adam) -> Tensor:
+    def _sky(self, geometry: Geometry, frozen: Tensor) -> Tensor:
         if self.sky is None:
-            return adam.frozen
-        return adam.frozen | torch.from_numpy(self.sky.contains(gaussians.means.numpy()))
+            return frozen
+        return frozen | torch.from_numpy(self.sky.contains(geometry.means.numpy()))
 
     def _recycled(
         self, step: DensityStep, kept: Tensor, gradient: Tensor, candidates: Tensor
@@ -130,5 +129,5 @@ class GradientDensity(Strategy):
         limit = min(missing, round(self.options.recycle_share * step.budget))
         count = round(RECYCLED_GRADIENT_SHARE * int(kept.sum()))
         idle = highest(-gradient, kept, count)
-        opacity = torch.sigmoid(step.gaussians.opacity_logits)
+        opacity = torch.sigmoid(step.geometry.opacity_logits)
         return highest(-opacity, idle & (opacity < RECYCLED_OPACITY), limit)

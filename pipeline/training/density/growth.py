@@ -12,14 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Geometry
 from pipeline.training.density.strategy import (
     Changes,
     DensityStep,
     Refinement,
     rotations,
 )
-from pipeline.training.optimisers.adam import Adam
 
 # A sampled split divides the scales by 0.8 N with N = 2 (3DGS).
 SPLIT_SHRINK = 1.6
@@ -58,7 +57,7 @@ class GradientStatistics:
         self.seen = torch.from_numpy(arrays["seen"])
 
 
-Halving = Callable[[Gaussians], Mapping[str, Tensor]]
+Halving = Callable[[Geometry], Mapping[str, Tensor]]
 """Returns the arrays that change by name, for 2 M Gaussians: M and their copies."""
 
 
@@ -82,12 +81,12 @@ def multiply(
     both = torch.cat([halves, halves])
     rows = torch.cat([stay, clones, both])
     number = torch.arange(len(rows))
-    values = halved(step.gaussians.select(both, step.threads)) if changes.split else {}
+    values = halved(step.geometry.select(both, step.threads)) if changes.split else {}
     changed = number[len(rows) - len(both) :]
     return Refinement(rows, number >= len(stay), changed, values, changes)
 
 
-def along_longest_axis(halves: Gaussians) -> dict[str, Tensor]:
+def along_longest_axis(halves: Geometry) -> dict[str, Tensor]:
     """A ``Halving``: each pair lies side by side along the longest axis, and is smaller and more
     transparent."""
     log_scales = halves.log_scales
@@ -105,7 +104,7 @@ def along_longest_axis(halves: Gaussians) -> dict[str, Tensor]:
     }
 
 
-def sampled(halves: Gaussians, rng: np.random.Generator) -> dict[str, Tensor]:
+def sampled(halves: Geometry, rng: np.random.Generator) -> dict[str, Tensor]:
     """A ``Halving``: positions are drawn from each Gaussian, and scales are smaller (3DGS)."""
     scales = halves.log_scales.exp()
     noise = torch.from_numpy(rng.standard_normal(scales.shape, np.float32))
@@ -116,19 +115,18 @@ def sampled(halves: Gaussians, rng: np.random.Generator) -> dict[str, Tensor]:
     }
 
 
-def longest_scale(gaussians: Gaussians) -> Tensor:
+def longest_scale(geometry: Geometry) -> Tensor:
     """(N,) the largest scale of each Gaussian, world units."""
-    return gaussians.log_scales.amax(1).exp()
+    return geometry.log_scales.amax(1).exp()
 
 
-def limit_opacity(gaussians: Gaussians, adam: Adam, unlimited: Tensor | None = None) -> None:
+def limit_opacity(geometry: Geometry, unlimited: Tensor | None = None) -> None:
     """Limit every opacity to ``RESET_OPACITY``, in place; those of useful Gaussians recover.
 
     Args:
         unlimited: (N,) bool, the rows that keep their opacity. None: none of them.
     """
-    limit = torch.full_like(gaussians.opacity_logits, math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    limit = torch.full_like(geometry.opacity_logits, math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     if unlimited is not None:
         limit[unlimited] = math.inf
-    torch.minimum(gaussians.opacity_logits, limit, out=gaussians.opacity_logits)
-    adam.forget("opacity_logits")
+    torch.minimum(geometry.opacity_logits, limit, out=geometry.opacity_logits)

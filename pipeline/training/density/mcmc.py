@@ -16,15 +16,15 @@ from torch import Tensor
 
 from pipeline.config.experiments import McmcExperiments
 from pipeline.render import Forward, Gradients
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Gaussians, Geometry
 from pipeline.training.density.strategy import (
     Changes,
     DensityStep,
     Refinement,
     Strategy,
     Update,
-    not_finite,
     rotations,
+    useless_values,
 )
 from pipeline.training.density.timeline import Timeline
 
@@ -77,52 +77,52 @@ class McmcDensity(Strategy):
 
     def after_step(self, step: DensityStep) -> Update:
         if self._has_noise(step.steps):
-            self._add_noise(step.gaussians, step.noise_rate, step.rng)
+            self._add_noise(step.geometry, step.noise_rate, step.rng)
         return super().after_step(step)
 
     def _has_noise(self, steps: range) -> bool:
         return self.options.noise and steps.stop - 1 <= self.timeline.stop
 
-    def _add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+    def _add_noise(self, geometry: Geometry, rate: float, rng: np.random.Generator) -> None:
         """Move transparent Gaussians by noise of their covariance (equation 8), in place."""
-        opacity = torch.sigmoid(gaussians.opacity_logits)
+        opacity = torch.sigmoid(geometry.opacity_logits)
         moved = torch.nonzero(opacity < NOISE_OPACITY)[:, 0]
         if not len(moved):
             return
         share = torch.sigmoid(-NOISE_SLOPE * (opacity[moved] - NOISE_MIDPOINT))
         draws = torch.from_numpy(rng.standard_normal((len(moved), 3), np.float32))
-        axes = rotations(gaussians.quats[moved])
-        variances = (2 * gaussians.log_scales[moved]).exp()
+        axes = rotations(geometry.quats[moved])
+        variances = (2 * geometry.log_scales[moved]).exp()
         noise = torch.einsum("nij,nj,nkj,nk->ni", axes, variances, axes, draws)
         size = NOISE * MEANS_LEARNING_RATE * rate / self.scale
-        gaussians.means[moved] += noise * (share * size)[:, None]
+        geometry.means[moved] += noise * (share * size)[:, None]
 
     def refine(self, step: DensityStep) -> Refinement:
         """Relocate transparent Gaussians onto others, drawn by opacity, and grow; without
         densification, remove them. Large Gaussians are left to the regulariser."""
-        gaussians, adam = step.gaussians, step.adam
-        useless = torch.sigmoid(gaussians.opacity_logits) <= self.options.prune_opacity
-        useless |= not_finite(gaussians, step.threads)
+        geometry = step.geometry
+        useless = torch.sigmoid(geometry.opacity_logits) <= self.options.prune_opacity
+        useless |= useless_values(step)
         alive = torch.nonzero(~useless)[:, 0]
         dead = int(useless.sum())
-        opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double()
-        weights = opacity.masked_fill(adam.frozen[alive], 0.0).numpy()
+        opacity = torch.sigmoid(geometry.opacity_logits[alive]).double()
+        weights = opacity.masked_fill(step.frozen[alive], 0.0).numpy()
         if not self.densifies_after(step.steps) or not weights.any():
             fresh = torch.zeros(len(alive), dtype=torch.bool)
             return Refinement(alive, fresh, torch.nonzero(fresh)[:, 0], {}, Changes(pruned=dead))
-        grown = min(step.budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
-        added = max(0, grown - len(gaussians))
+        grown = min(step.budget, math.ceil(len(geometry) * (1 + self.options.growth_share)))
+        added = max(0, grown - len(geometry))
         chosen = step.rng.choice(len(alive), size=dead + added, p=weights / weights.sum())
         copies = torch.from_numpy(np.bincount(chosen, minlength=len(alive)))
         sources = alive[torch.from_numpy(np.sort(chosen))]
         shared = torch.nonzero(copies)[:, 0]
         logits, shrink = share_out(
-            gaussians.opacity_logits[alive[shared]], copies[shared] + 1, self.options.prune_opacity
+            geometry.opacity_logits[alive[shared]], copies[shared] + 1, self.options.prune_opacity
         )
-        log_scales = gaussians.log_scales[alive[shared]] + shrink[:, None]
+        log_scales = geometry.log_scales[alive[shared]] + shrink[:, None]
         rows = torch.cat([alive, sources])
         # (N,) int64, the place of each row in ``shared``, or -1.
-        place = torch.full((len(gaussians),), -1)
+        place = torch.full((len(geometry),), -1)
         place[alive[shared]] = torch.arange(len(shared))
         # The moments of relocated-onto Gaussians belong to the old opacity and scale.
         fresh = place[rows] >= 0

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Geometry
 from pipeline.training.density.growth import (
     GradientStatistics,
     limit_opacity,
@@ -29,10 +29,9 @@ from pipeline.training.density.strategy import (
     Refinement,
     Strategy,
     highest,
-    not_finite,
+    useless_values,
 )
 from pipeline.training.density.timeline import Timeline, shrunk, shrunk_interval
-from pipeline.training.optimisers.adam import Adam
 
 #: densify_from_iter, densify_until_iter (density control takes place before this step),
 #: densification_interval and opacity_reset_interval, in steps.
@@ -86,13 +85,13 @@ class OriginalDensity(Strategy):
 
     def refine(self, step: DensityStep) -> Refinement:
         """Split and clone, then prune."""
-        every = torch.ones(len(step.gaussians), dtype=torch.bool)
+        every = torch.ones(len(step.geometry), dtype=torch.bool)
         grow = torch.zeros_like(every)
         if self.densifies_after(step.steps):
             gradient = self.observed.mean()
-            room = max(0, step.budget - len(step.gaussians))
+            room = max(0, step.budget - len(step.geometry))
             grow = highest(gradient, gradient >= GRADIENT_THRESHOLD, room)
-        large = longest_scale(step.gaussians) > PERCENT_DENSE * self.extent
+        large = longest_scale(step.geometry) > PERCENT_DENSE * self.extent
         grown = multiply(
             step,
             every,
@@ -100,20 +99,20 @@ class OriginalDensity(Strategy):
             split=grow & large,
             halved=partial(sampled, rng=step.rng),
         )
-        gaussians, rows = step.gaussians, grown.rows
-        useless = torch.sigmoid(gaussians.opacity_logits[rows]) < MIN_OPACITY
-        useless |= not_finite(gaussians, step.threads)[rows]
+        rows = grown.rows
+        useless = torch.sigmoid(step.geometry.opacity_logits[rows]) < MIN_OPACITY
+        useless |= useless_values(step)[rows]
         for values in grown.values.values():
             useless[grown.changed] |= ~torch.isfinite(values).all(1)
         if any(map(self.prunes_large_after, step.steps)):
-            log_scales = grown.array("log_scales", gaussians, step.threads)
+            log_scales = grown.array("log_scales", step)
             useless |= log_scales.amax(1).exp() > MAX_SCALE * self.extent
         grown.changes.pruned = int(useless.sum())
         self.start(len(rows) - grown.changes.pruned)
         return grown.select(torch.nonzero(~useless)[:, 0])
 
-    def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        limit_opacity(gaussians, adam)
+    def reset_opacity(self, geometry: Geometry, frozen: Tensor) -> None:
+        limit_opacity(geometry)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         return self.observed.arrays()

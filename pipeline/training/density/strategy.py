@@ -2,13 +2,14 @@
 
 After the backward pass, the backend accumulates ``statistics``; ``before_step`` is called for a
 strategy that has none. ``Trainer.control_density`` calls ``after_step`` after the update of the
-parameters, if ``is_due``.
+parameters, if ``is_due``. It decides by the geometry of the Gaussians, and returns what changes;
+colours and moments, which can be in the memory of a device, follow (``StepEngine.apply``).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,11 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render import Forward, Gradients
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Gaussians, Geometry
 from pipeline.splats.morton import morton_order
 from pipeline.splats.rows import for_ranges, take_rows
 from pipeline.training.density.timeline import Timeline
-from pipeline.training.optimisers.adam import Adam
 
 
 @dataclass
@@ -52,7 +52,9 @@ class DensityStep:
     """What a strategy works on after an optimiser step.
 
     Attributes:
-        gaussians, adam: The Gaussians, and their moments, which the strategy changes in place.
+        geometry: The geometry of the Gaussians, which the strategy may change in place.
+        frozen: (N,) bool, the Gaussians that steps do not change.
+        bad_colors: Returns (N,) bool, the Gaussians with colours that are not finite.
         rng: The generator of the random numbers of the run.
         steps: The steps of the schedule that the optimiser step covers: one, or any number with a
             time budget.
@@ -62,8 +64,9 @@ class DensityStep:
         threads: The number of threads that search and copy Gaussians.
     """
 
-    gaussians: Gaussians
-    adam: Adam
+    geometry: Geometry
+    frozen: Tensor
+    bad_colors: Callable[[], Tensor]
     rng: np.random.Generator
     steps: range
     noise_rate: float = 1.0
@@ -79,7 +82,7 @@ class Refinement:
     Attributes:
         rows: (M,) int64, the row that each Gaussian is copied from.
         fresh: (M,) bool, the Gaussians without moments.
-        changed: (K,) int64, the Gaussians that are not copies in all arrays.
+        changed: (K,) int64, the Gaussians whose geometry is not a copy in all arrays.
         values: Their values, (K, ...), by the names of the arrays that are not copied.
         changes: What was changed.
     """
@@ -90,9 +93,9 @@ class Refinement:
     values: Mapping[str, Tensor]
     changes: Changes
 
-    def array(self, name: str, gaussians: Gaussians, threads: int) -> Tensor:
-        """An array of the new set."""
-        array = take_rows({name: gaussians.tensors()[name]}, self.rows, threads)[name]
+    def array(self, name: str, step: DensityStep) -> Tensor:
+        """An array of the geometry of the new set."""
+        array = take_rows({name: step.geometry.tensors()[name]}, self.rows, step.threads)[name]
         if name in self.values:
             array[self.changed] = self.values[name]
         return array
@@ -111,13 +114,9 @@ class Refinement:
             values={name: values[kept] for name, values in self.values.items()},
         )
 
-    def copy(self, step: DensityStep) -> Gaussians:
-        """The Gaussians of the new set; the moments become theirs."""
-        step.adam.select(self.rows, self.fresh, step.threads)
-        gaussians = step.gaussians.select(self.rows, step.threads)
-        for name, values in self.values.items():
-            gaussians.tensors()[name][self.changed] = values
-        return gaussians
+    def geometry(self, step: DensityStep) -> Geometry:
+        """The geometry of the new set."""
+        return Geometry(**{name: self.array(name, step) for name in step.geometry.tensors()})
 
 
 @dataclass(frozen=True)
@@ -125,18 +124,19 @@ class Update:
     """The result of a strategy's work after a step.
 
     Attributes:
-        gaussians: The Gaussians after it.
-        changes: None if the set of Gaussians is the same as before.
-        opacity_reset: Whether all opacities were reset.
+        geometry: The geometry of the Gaussians after it.
+        refinement: None if the set of Gaussians is the same as before. Otherwise, colours and
+            moments are to be copied by its rows.
+        opacity_reset: Whether all opacities were reset: their moments are to be forgotten.
     """
 
-    gaussians: Gaussians
-    changes: Changes | None
+    geometry: Geometry
+    refinement: Refinement | None
     opacity_reset: bool
 
 
 class Strategy:
-    """Observes every step and, on its timeline, changes the set of Gaussians and Adam's moments.
+    """Observes every step and, on its timeline, changes the set of Gaussians.
 
     Subclasses implement ``start`` and ``refine``; the other hooks do nothing unless they are
     overridden.
@@ -173,17 +173,19 @@ class Strategy:
 
     def after_step(self, step: DensityStep) -> Update:
         """The hook after an optimiser step: noise, densification, pruning and opacity resets."""
-        gaussians, changes = step.gaussians, None
+        geometry, frozen, refinement = step.geometry, step.frozen, None
         if step.prune or self.refines_after(step.steps):
             refinement = self.refine(step)
             # Neighbours in space become neighbours in memory, and the rasterizer skips invisible
             # ones in blocks.
-            order = morton_order(refinement.array("means", gaussians, step.threads), step.threads)
-            gaussians, changes = refinement.select(order).copy(step), refinement.changes
+            order = morton_order(refinement.array("means", step), step.threads)
+            refinement = refinement.select(order)
+            geometry = refinement.geometry(step)
+            frozen = frozen[refinement.rows] & ~refinement.fresh
         reset = any(map(self.resets_opacity_after, step.steps))
         if reset:
-            self.reset_opacity(gaussians, step.adam)
-        return Update(gaussians, changes, reset)
+            self.reset_opacity(geometry, frozen)
+        return Update(geometry, refinement, reset)
 
     def start(self, count: int) -> None:
         """Forget all observations; ``count`` Gaussians are observed from here on."""
@@ -198,8 +200,8 @@ class Strategy:
         """
         raise NotImplementedError
 
-    def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        """Lower all opacities, in place."""
+    def reset_opacity(self, geometry: Geometry, frozen: Tensor) -> None:
+        """Lower all opacities but those of ``frozen`` (N,) bool Gaussians, in place."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of a checkpoint, sharing memory."""
@@ -209,18 +211,24 @@ class Strategy:
         """Restore the state that ``arrays()`` returned; other keys are ignored."""
 
 
-def not_finite(gaussians: Gaussians, threads: int = 1) -> Tensor:
-    """(N,) bool: rows with a value that is not finite."""
-    bad = torch.zeros(len(gaussians), dtype=torch.bool)
+def useless_values(step: DensityStep) -> Tensor:
+    """(N,) bool: Gaussians with a value that is not finite."""
+    return not_finite(step.geometry.tensors(), step.threads) | step.bad_colors()
+
+
+def not_finite(tensors: Mapping[str, Tensor], threads: int = 1) -> Tensor:
+    """(N,) bool: rows of tensors (N, ...) with a value that is not finite."""
+    count = min(map(len, tensors.values()))
+    bad = torch.zeros(count, dtype=torch.bool)
 
     def find(rows: slice) -> None:
-        for tensor in gaussians.tensors().values():
+        for tensor in tensors.values():
             part = tensor[rows]
             # A sum is finite only if all values are, and takes less time than a search.
             if not math.isfinite(float(part.sum())):
                 bad[rows] |= ~torch.isfinite(part).reshape(len(part), part[:1].numel()).all(1)
 
-    for_ranges(len(gaussians), threads, find)
+    for_ranges(count, threads, find)
     return bad
 
 

@@ -6,23 +6,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from pipeline.render import Backend
 from pipeline.render.resident import (
     Optimised,
+    Part,
     Planes,
     ResidentImage,
     ResidentStep,
     ResidentTraining,
 )
 from pipeline.render.resident import StepResult as ResidentResult
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.rows import new_rows
 from pipeline.training.data.targets import psnr_of
+from pipeline.training.density import Update
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
 from pipeline.training.losses.plane import summed_gradients
+from pipeline.training.optimisers.adam import Adam
 from pipeline.training.run import TrainingRun
 
 # The number of steps whose results are read at once.
@@ -42,8 +48,8 @@ class DeviceStep(StepEngine):
     results, unless the next step depends on them: refined cameras and embeddings are updated on the
     CPU.
 
-    Before the tensors of ``state`` are read, ``fetch`` makes them current; after they were changed,
-    ``invalidate`` makes the next step copy them again.
+    The device has the tensors of ``state`` from the first step on. Before a part of them is read,
+    ``fetch`` makes it current. Only the methods below change them.
     """
 
     def __init__(
@@ -56,16 +62,14 @@ class DeviceStep(StepEngine):
     ) -> None:
         super().__init__(scene, state, run, backend)
         self.training = training
-        self._loaded = False  # The device has the tensors of the state, or newer ones.
-        self._ahead = False  # The device has newer ones.
+        self._loaded = False
+        self._current = Part.ALL  # The part of the tensors of the state that is current.
         self._started: list[_Started] = []
 
     def step(self, step: Step) -> Sequence[StepResult]:
         state, view, options = self.state, step.view, self.run.options
-        if not self._loaded:
-            self.training.load(self._optimised())
-            self._loaded = True
-        self._ahead = True
+        self._load()
+        self._current = Part.NOTHING
         embedding = None
         if state.appearance is not None:
             embedding = tuple(state.appearance.embeddings[view.index])
@@ -112,15 +116,60 @@ class DeviceStep(StepEngine):
         psnr = psnr_of(result.squared_error)
         return StepResult(started.number, result.loss, psnr, result.num_visible, result.num_dropped)
 
-    def fetch(self) -> None:
+    def fetch(self, part: Part = Part.ALL) -> None:
         assert not self._started
-        if self._ahead:
-            self.training.store(self._optimised())
-            self._ahead = False
+        if self._current < part:
+            self.training.store(self._optimised(), part)
+            self._current = part
 
-    def invalidate(self) -> None:
-        self.fetch()
-        self._loaded = False
+    def lend(self) -> None:
+        self.training.lend(self.state.gaussians.parameters())
+
+    def bad_colors(self) -> Tensor:
+        return self.training.bad_colors()
+
+    def apply(self, update: Update) -> None:
+        assert not self._started and self._current >= Part.GEOMETRY
+        state, adam, refinement = self.state, self.state.adam, update.refinement
+        if refinement is not None:
+            rows, fresh = refinement.rows, refinement.fresh
+            one = state.gaussians.first(1)
+            self._select(rows, fresh, one, Adam(one, adam.options, adam.backend))
+            adam.frozen = adam.frozen[rows] & ~fresh
+        state.gaussians = Gaussians(**update.geometry.tensors(), **state.gaussians.colors())
+        self.training.load(self._optimised(), Part.GEOMETRY)
+        if update.opacity_reset:
+            adam.forget("opacity_logits")
+            self.training.load_moments(self._optimised(), "opacity_logits")
+        self._current = Part.GEOMETRY
+
+    def raise_sh_degree(self, degree: int) -> None:
+        self._load()
+        adam, one = self.state.adam, self.state.gaussians.first(1).with_sh_degree(degree)
+        frozen = Adam(one, adam.options, adam.backend)
+        frozen.freeze(torch.ones(1, dtype=torch.bool))
+        self._select(torch.arange(len(adam.frozen)), adam.frozen, one, frozen)
+        self._current = Part.NOTHING
+
+    def _load(self) -> None:
+        if not self._loaded:
+            self.training.load(self._optimised())
+            self._loaded = True
+
+    def _select(self, rows: Tensor, blank: Tensor, one: Gaussians, adam: Adam) -> None:
+        """See ``ResidentTraining.select``. The tensors of the state get the new shapes, but no
+        values.
+
+        Args:
+            one, adam: One Gaussian and its moments.
+        """
+        row = _optimised(one, adam, (torch.zeros(1), torch.zeros(1)))
+        self.training.select(rows, blank, row)
+        state, count = self.state, len(rows)
+        state.gaussians = Gaussians(**new_rows(one.tensors(), count))
+        state.adam.first = new_rows(adam.first, count)
+        state.adam.second = new_rows(adam.second, count)
+        state.adam.last = new_rows({"last": adam.last}, count)["last"]
 
     def _image(self, step: Step) -> ResidentImage:
         view, target = step.view, step.view.target
@@ -137,8 +186,10 @@ class DeviceStep(StepEngine):
         )
 
     def _optimised(self) -> Optimised:
-        state, adam = self.state, self.state.adam
-        assert state.density.statistics is not None
-        return Optimised(
-            state.gaussians.tensors(), adam.first, adam.second, adam.last, *state.density.statistics
-        )
+        statistics = self.state.density.statistics
+        assert statistics is not None
+        return _optimised(self.state.gaussians, self.state.adam, statistics)
+
+
+def _optimised(gaussians: Gaussians, adam: Adam, statistics: tuple[Tensor, Tensor]) -> Optimised:
+    return Optimised(gaussians.tensors(), adam.first, adam.second, adam.last, *statistics)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from torch import Tensor
+
 from pipeline.render import (
     Backend,
     Forward,
@@ -13,8 +15,11 @@ from pipeline.render import (
     RasterOptions,
     ViewGradients,
 )
+from pipeline.render.resident import Part
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.step_view import StepView
+from pipeline.training.density import Update
+from pipeline.training.density.strategy import not_finite
 from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
@@ -119,11 +124,21 @@ class OperatorStep(StepEngine):
             appearance.hide(gaussians, shown)
         return self.color_loss.gradients(rendered, view).psnr
 
-    def fetch(self) -> None:
+    def fetch(self, part: Part = Part.ALL) -> None:
         """The tensors of the state are always current."""
 
-    def invalidate(self) -> None:
-        """There are no copies of the tensors of the state."""
+    def lend(self) -> None:
+        """The backend renders the tensors of the state."""
+
+    def bad_colors(self) -> Tensor:
+        return not_finite(self.state.gaussians.colors(), self.run.threads)
+
+    def apply(self, update: Update) -> None:
+        self.state.apply(update, self.run.threads)
+
+    def raise_sh_degree(self, degree: int) -> None:
+        self.state.gaussians = self.state.gaussians.with_sh_degree(degree)
+        self.state.adam.resize_bands(degree)
 
     def _update_photograph(self, step: Step, gradients: ViewGradients) -> None:
         """Update what belongs to the photograph: its camera and its appearance."""

@@ -97,13 +97,21 @@ class TrainState:
         self.position += 1
         return int(self.order[self.position - 1])
 
-    def apply(self, update: Update) -> bool:
-        """Take over what density control did; returns whether the set of Gaussians changed."""
-        self.gaussians = update.gaussians
+    def apply(self, update: Update, threads: int) -> None:
+        """Change the Gaussians and their moments as density control has decided."""
+        colors, refinement = self.gaussians.colors(), update.refinement
+        if refinement is not None:
+            self.adam.select(refinement.rows, refinement.fresh, threads)
+            colors = self.adam.backend.take_rows(colors, refinement.rows, threads=threads)
+        self.gaussians = Gaussians(**update.geometry.tensors(), **colors)
+        if update.opacity_reset:
+            self.adam.forget("opacity_logits")
+
+    def count(self, update: Update) -> None:
+        """Add what density control has decided to the counters."""
         self.counters.opacity_resets += update.opacity_reset
-        if update.changes is not None:
-            self.counters.changes.add(update.changes)
-        return update.changes is not None
+        if update.refinement is not None:
+            self.counters.changes.add(update.refinement.changes)
 
     def add_to_window(self, loss: float, psnr: float) -> None:
         """Add a step to the sums of the curve's next record."""
@@ -192,10 +200,11 @@ class TrainState:
         self.step, self.order = step, arrays["order"]
         self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians, self.adam.options, self.adam.backend)
-        for name in self.gaussians.tensors():
-            self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
-            self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
-        self.adam.last = torch.from_numpy(arrays["last"])
+        first, second = (
+            {name: torch.from_numpy(arrays[f"{each}.{name}"]) for name in self.gaussians.tensors()}
+            for each in ("first", "second")
+        )
+        self.adam.restore(first, second, torch.from_numpy(arrays["last"]))
         self.density.restore(arrays)
         self.cameras.restore(arrays)
         if self.appearance is not None:

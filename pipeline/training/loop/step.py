@@ -7,9 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from pipeline.render import Backend, RasterOptions
+from pipeline.render.resident import Part
 from pipeline.runtime.errors import UserError
 from pipeline.training.data.step_view import StepView
+from pipeline.training.density import Update
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 from pipeline.training.losses.alpha import AlphaLoss
@@ -76,14 +80,27 @@ class StepEngine(ABC):
         """
 
     @abstractmethod
-    def fetch(self) -> None:
-        """Make the tensors of ``state`` current, before they are read. To be called after
-        ``results``."""
+    def fetch(self, part: Part = Part.ALL) -> None:
+        """Make a part of the tensors of ``state`` current, before they are read. To be called after
+        ``results``, as the methods below."""
 
     @abstractmethod
-    def invalidate(self) -> None:
-        """Make the tensors of ``state`` current, and read them again before the next step. To be
-        called after ``results`` and before they are changed."""
+    def lend(self) -> None:
+        """Let the backend render the Gaussians of ``state`` until they change, though only
+        ``Part.GEOMETRY`` was fetched."""
+
+    @abstractmethod
+    def bad_colors(self) -> Tensor:
+        """(N,) bool, the Gaussians with colours that are not finite."""
+
+    @abstractmethod
+    def apply(self, update: Update) -> None:
+        """Change the Gaussians and their moments as density control has decided, after
+        ``Part.GEOMETRY`` was fetched."""
+
+    @abstractmethod
+    def raise_sh_degree(self, degree: int) -> None:
+        """Add SH coefficients of 0, with moments of 0."""
 
     def require_finite(self, loss: float, view: StepView, number: int) -> None:
         """Raise a UserError if the loss of step ``number`` is not finite."""

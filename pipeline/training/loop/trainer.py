@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.config.settled import TrainOptions
 from pipeline.render import BACKGROUNDS, Backend, Color, RasterCamera, RasterOptions
+from pipeline.render.resident import Part
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import release_free_memory
 from pipeline.splats.gaussians import Gaussians
@@ -82,7 +83,7 @@ class Trainer:
     def finish(self) -> None:
         """Remove the Gaussians that had no gradient in the last epoch, and those on the path
         between cameras that hide the scene from there."""
-        self.fetch()
+        self.fetch(Part.PARAMETERS)
         self.backend.release_memory()
         state = self.state
         state.drop_unseen(len(self.scene.views), self.scene.sky)
@@ -95,15 +96,10 @@ class Trainer:
         """Wait for the results of all steps, before the figures of ``state`` are read."""
         self.count(self.engine.results())
 
-    def fetch(self) -> None:
-        """Make ``state`` current, before it is read."""
+    def fetch(self, part: Part = Part.ALL) -> None:
+        """Make ``state`` current, with this part of its tensors, before it is read."""
         self.settle()
-        self.engine.fetch()
-
-    def invalidate(self) -> None:
-        """Make ``state`` current, before its tensors are changed."""
-        self.settle()
-        self.engine.invalidate()
+        self.engine.fetch(part)
 
     def next_view(self) -> StepView:
         """The view of this step: each view once in each shuffled epoch, but for that held back."""
@@ -153,7 +149,7 @@ class Trainer:
         transients_due = state.transients is not None and state.transients.is_due(steps, run_length)
         if not floaters_due and not transients_due and not state.density.is_due(steps):
             return
-        self.invalidate()
+        self.fetch(Part.GEOMETRY)
         faded = self.fade_ghosts() if transients_due else 0
         faded += self.fade_floaters() if floaters_due else 0
         if self.run.is_part:
@@ -161,27 +157,28 @@ class Trainer:
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
         limit = schedule.budget_at(state.clock)
         budget = self.clock.budget(state, limit)
-        changed = state.apply(
-            state.density.after_step(
-                DensityStep(
-                    state.gaussians,
-                    state.adam,
-                    state.rng,
-                    steps,
-                    noise_rate=rate,
-                    budget=budget,
-                    prune=faded > 0,
-                    threads=self.run.threads,
-                )
+        update = state.density.after_step(
+            DensityStep(
+                state.gaussians.geometry,
+                state.adam.frozen,
+                self.engine.bad_colors,
+                state.rng,
+                steps,
+                noise_rate=rate,
+                budget=budget,
+                prune=faded > 0,
+                threads=self.run.threads,
             )
         )
-        if changed:
+        if not len(update.geometry):
+            raise UserError(
+                f"no Gaussian is left at step {state.step}: all became transparent",
+                fix="check the poses and the masks; init.method: points may help",
+            )
+        state.count(update)
+        self.engine.apply(update)
+        if update.refinement is not None:
             release_free_memory()
-            if not len(state.gaussians):
-                raise UserError(
-                    f"no Gaussian is left at step {state.step}: all became transparent",
-                    fix="check the poses and the masks; init.method: points may help",
-                )
 
     def fade_floaters(self) -> int:
         """Make floaters transparent, and return their number."""
@@ -196,6 +193,10 @@ class Trainer:
         number."""
         state = self.state
         assert state.transients is not None
+        if state.appearance is None:
+            self.engine.lend()
+        else:  # The colours in each photograph are computed here.
+            self.engine.fetch(Part.PARAMETERS)
         ghosts = state.transients.search(self.reduced_photographs())
         state.gaussians.opacity_logits[ghosts] = FADED_LOGIT
         found = int(ghosts.sum())
@@ -206,9 +207,8 @@ class Trainer:
         """Allocate the coefficients of higher degrees when they come into use."""
         degree = self.schedule.sh_degree_at(self.state.clock)
         if degree > self.state.gaussians.sh_degree:
-            self.invalidate()
-            self.state.gaussians = self.state.gaussians.with_sh_degree(degree)
-            self.state.adam.resize_bands(degree)
+            self.settle()
+            self.engine.raise_sh_degree(degree)
 
     def factor(self) -> int:
         """Factor by which images are reduced in this step."""

@@ -7,6 +7,7 @@ in 3DGS.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -25,7 +26,6 @@ from pipeline.render import (
     make_backend,
 )
 from pipeline.splats.gaussians import Gaussians, resize_bands
-from pipeline.splats.rows import take_rows
 
 BETA2 = 0.999
 # As in 3DGS: gradients of a mean over all pixels are far below the usual 1e-8.
@@ -112,6 +112,7 @@ class Adam:
             moments of means and quaternions are (N, 1), shared by their components. Either way,
             results do not depend on the orientation of the world.
         last: (N,) int32, the last step in which each row had a gradient.
+        frozen: (N,) bool, the rows that steps do not change.
     """
 
     def __init__(self, gaussians: Gaussians, options: AdamOptions, backend: Backend | None = None):
@@ -128,6 +129,7 @@ class Adam:
             self.second["means"] = torch.zeros(count, 1)
             self.second["quats"] = torch.zeros(count, 1)
         self.last = torch.zeros(count, dtype=torch.int32)
+        self.frozen = torch.zeros(count, dtype=torch.bool)
 
     def rates(self, step: AdamStep) -> dict[str, AdamRates]:
         """The rates of each array by its name. With ``own_frames``, ``frames`` has those of means
@@ -175,29 +177,37 @@ class Adam:
 
     def select(self, rows: Tensor, fresh: Tensor, threads: int = 1) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""
-        self.first = take_rows(self.first, rows, threads, fresh)
-        self.second = take_rows(self.second, rows, threads, fresh)
+        self.first = self.backend.take_rows(self.first, rows, fresh, threads)
+        self.second = self.backend.take_rows(self.second, rows, fresh, threads)
         self.last = self.last[rows]
-
-    @property
-    def frozen(self) -> Tensor:
-        """(N,) bool, the rows that steps do not change."""
-        return self.second["opacity_logits"] > FROZEN_ABOVE
+        self.frozen = self.frozen[rows] & ~fresh
 
     def freeze(self, rows: Tensor) -> None:
         """Keep ``rows``, (N,) bool, as they are in all steps."""
-        for moments in self.second.values():
-            moments[rows] = FROZEN
+        self.frozen = self.frozen | rows
+        self._reset_frozen(self.first)
 
     def forget(self, name: str) -> None:
         """Zero the moments of one array."""
-        frozen = self.frozen
         self.first[name].zero_()
         self.second[name].zero_()
-        self.freeze(frozen)
+        self._reset_frozen([name])
+
+    def restore(
+        self, first: Mapping[str, Tensor], second: Mapping[str, Tensor], last: Tensor
+    ) -> None:
+        """Restore the moments, from which frozen rows are known."""
+        self.first, self.second, self.last = dict(first), dict(second), last
+        self.frozen = self.second["opacity_logits"] > FROZEN_ABOVE
 
     def resize_bands(self, degree: int) -> None:
         """Resize the moments as ``Gaussians.with_sh_degree`` does."""
         for moments in (self.first, self.second):
             moments["sh"] = resize_bands(moments["sh"], degree)
-        self.freeze(self.frozen)
+        self._reset_frozen(self.first)
+
+    def _reset_frozen(self, names: Iterable[str]) -> None:
+        """Give the frozen rows of these arrays the moments that keep them."""
+        for name in names:
+            self.first[name][self.frozen] = 0.0
+            self.second[name][self.frozen] = FROZEN

@@ -17,6 +17,7 @@ from pipeline.config.experiments import GradientExperiments, McmcExperiments, Tr
 from pipeline.config.settled import TrainOptions
 from pipeline.render import make_backend
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.rows import take_rows
 from pipeline.splats.skybox import Sky
 from pipeline.training.density import DensityStep, Strategy, make_strategy
 from pipeline.training.density.gradient import GradientDensity
@@ -29,7 +30,14 @@ from pipeline.training.density.growth import (
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
-from pipeline.training.density.strategy import Changes, Refinement, highest, rotations
+from pipeline.training.density.strategy import (
+    Changes,
+    Refinement,
+    highest,
+    not_finite,
+    rotations,
+)
+from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
 
@@ -66,7 +74,23 @@ def step_of(
     due = next(n for n in range(STEPS, 0, -1) if density.timeline.densifies_after(n))
     number = due if densify else 1
     rng = np.random.Generator(np.random.PCG64(seed))
-    return DensityStep(gaussians, adam, rng, range(number, number + 1), budget=budget, prune=True)
+    steps = range(number, number + 1)
+    return replace(inputs(gaussians, adam, rng, steps), budget=budget, prune=True)
+
+
+def inputs(gaussians: Gaussians, adam: Adam, rng: np.random.Generator, steps: range) -> DensityStep:
+    """What a strategy works on after these steps."""
+    colors = gaussians.colors()
+    return DensityStep(gaussians.geometry, adam.frozen, lambda: not_finite(colors), rng, steps)
+
+
+def copied(
+    refinement: Refinement, step: DensityStep, gaussians: Gaussians, adam: Adam
+) -> Gaussians:
+    """The Gaussians of a refinement; the moments become theirs."""
+    adam.select(refinement.rows, refinement.fresh)
+    colors = take_rows(gaussians.colors(), refinement.rows, 1)
+    return Gaussians(**refinement.geometry(step).tensors(), **colors)
 
 
 def refine(
@@ -78,7 +102,7 @@ def refine(
     budget: int = 1_000_000,
 ) -> Gaussians:
     step = step_of(density, gaussians, adam, densify=densify, budget=budget)
-    return density.refine(step).copy(step)
+    return copied(density.refine(step), step, gaussians, adam)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -93,7 +117,7 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
 
     step = step_of(density, gaussians, adam, densify=densify, budget=budget)
     refinement = density.refine(step)
-    result, changes = refinement.copy(step), refinement.changes
+    result, changes = copied(refinement, step, gaussians, adam), refinement.changes
 
     assert len(result) == count - changes.pruned + changes.cloned + changes.split
     assert len(result) <= max(budget, count - changes.pruned)
@@ -132,9 +156,9 @@ def test_a_selection_of_a_refinement_copies_the_selected_rows(count: int, seed: 
         gaussians, adam = marked(10)
         step = step_of(strategy(10), gaussians, adam)
         if before:
-            result = refinement.select(which).copy(step)
+            result = copied(refinement.select(which), step, gaussians, adam)
         else:
-            result = refinement.copy(step).select(which)
+            result = copied(refinement, step, gaussians, adam).select(which)
             adam.select(which, torch.zeros(len(which), dtype=torch.bool))
         found.append([*result.tensors().values(), *adam.first.values(), *adam.second.values()])
     assert all(map(torch.equal, *found))
@@ -236,7 +260,12 @@ def test_values_that_are_not_finite_are_removed(name: str) -> None:
 def test_an_opacity_reset_limits_opacities_and_clears_moments() -> None:
     gaussians, adam = marked(4)
     gaussians.opacity_logits[0] = -7.0
-    strategy(4).reset_opacity(gaussians, adam)
+    density = strategy(4, opacity_reset_interval=1000)
+    number = next(n for n in range(1, STEPS) if density.resets_opacity_after(n))
+    steps = range(number, number + 1)
+    update = density.after_step(inputs(gaussians, adam, np.random.default_rng(0), steps))
+    assert update.opacity_reset and update.refinement is None
+    TrainState.apply(SimpleNamespace(gaussians=gaussians, adam=adam), update, 1)  # type: ignore[arg-type]
     opacity = torch.sigmoid(gaussians.opacity_logits)
     assert opacity[0] < 0.001
     assert torch.allclose(opacity[1:], torch.tensor(0.01))
@@ -253,13 +282,13 @@ def test_the_sky_is_neither_reset_nor_too_large() -> None:
     )
     density.start(6)
     before = gaussians.opacity_logits[0].clone()
-    density.reset_opacity(gaussians, adam)
+    density.reset_opacity(gaussians.geometry, adam.frozen)
     assert gaussians.opacity_logits[0] == before
     assert torch.allclose(torch.sigmoid(gaussians.opacity_logits[1:]), torch.tensor(0.01))
     after_reset = density.reset_interval + 1
     due = next(n for n in range(after_reset, 30_000) if density.prunes_large_after(n))
-    step = DensityStep(gaussians, adam, np.random.default_rng(0), range(due, due + 1))
-    refined = density.refine(step).copy(step)
+    step = inputs(gaussians, adam, np.random.default_rng(0), range(due, due + 1))
+    refined = density.refine(step).geometry(step)
     assert refined.log_scales.max() == 5.0 and len(refined) == 5
 
 
@@ -276,7 +305,7 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
     density = mcmc(growth_share=0.2)
     step = step_of(density, gaussians, adam, densify=densify, budget=budget, seed=seed)
     refinement = density.refine(step)
-    result, changes = refinement.copy(step), refinement.changes
+    result, changes = copied(refinement, step, gaussians, adam), refinement.changes
     alive = count - int(faint.sum())
     if densify and alive:
         assert len(result) == max(count, min(budget, math.ceil(1.2 * count)))
@@ -319,7 +348,7 @@ def test_noise_moves_transparent_gaussians_along_their_axes() -> None:
     adam = Adam(gaussians, AdamOptions(0.8, own_frames=True))
     rng = np.random.Generator(np.random.PCG64(0))
     assert mcmc().is_due(range(1, 2))
-    mcmc().after_step(DensityStep(gaussians, adam, rng, range(1, 2), noise_rate=1e-2))
+    mcmc().after_step(replace(inputs(gaussians, adam, rng, range(1, 2)), noise_rate=1e-2))
     moved = (gaussians.means - before).abs()
     assert not moved[1000:].any()
     assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
@@ -360,7 +389,8 @@ def test_density_control_does_not_depend_on_the_unit(
             density.observed.seen += 1
         step = replace(step_of(density, gaussians, adam, budget=300), noise_rate=1e-2)
         update = density.after_step(step)
-        result, changes = update.gaussians, update.changes
+        assert update.refinement is not None
+        result, changes = update.geometry, update.refinement.changes
         log_scales = result.log_scales - math.log(unit)
         found.append((changes, costs.log_scales, result.means / unit, log_scales))
     assert found[0][0] == found[1][0]
@@ -392,9 +422,9 @@ def test_the_published_strategy_prunes_after_it_densifies() -> None:
     density.observed.seen += 1
     density.observed.gradient_sum = torch.tensor([3e-4, 3e-4, 3e-4, 0.0])
     rng = np.random.Generator(np.random.PCG64(0))
-    step = DensityStep(gaussians, adam, rng, range(9000, 9001), budget=100)
+    step = replace(inputs(gaussians, adam, rng, range(9000, 9001)), budget=100)
     refinement = density.refine(step)
-    result, changes = refinement.copy(step), refinement.changes
+    result, changes = copied(refinement, step, gaussians, adam), refinement.changes
     assert (changes.cloned, changes.split, changes.pruned) == (1, 2, 3)
     scales = result.log_scales.exp()[:, 0]
     assert torch.allclose(scales, torch.tensor([0.009, 0.009, 0.0125, 0.0125]))

@@ -58,6 +58,7 @@ KERNELS = {
     "blend_backward": "blend backward",
     "project_backward_update": "projection backward, Adam",
 }
+UNTIMED = "take_rows", "release_memory", "loop_time"  # inside density control, or between steps
 CONTROL, REST = "density control", "other Python and torch"
 ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, REST)
 # The time that other programs run, over the time on the clock, in a turn that counts as quiet.
@@ -155,8 +156,7 @@ class Run:
                 name: self.phases.timed(phase, getattr(cpu._ops(), name))
                 for name, phase in KERNELS.items()
             },
-            release_memory=cpu._ops().release_memory,
-            loop_time=cpu._ops().loop_time,
+            **{name: getattr(cpu._ops(), name) for name in UNTIMED},
         )
         scene = load_scene(inputs, run, print)
         state = initial_state(scene, run, backend, print)

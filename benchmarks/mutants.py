@@ -143,7 +143,7 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "no_drift": Mutant(
         f"{_CSRC}/sh_adam.h",
-        "if (missed) p -= rate * past.drift * m * inverse_root(v);",
+        "if (missed) p -= rate * m * load<f32x16>(before + 16 * j);",
         "",
         "what Adam would have done out of view never made good",
         _LOSS,

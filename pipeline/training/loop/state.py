@@ -148,7 +148,10 @@ class TrainState:
         result: dict[str, NDArray[Any]] = {"order": self.order}
         for name, tensor in self.gaussians.tensors().items():
             result[f"parameter.{name}"] = tensor.numpy()
-            result[f"first.{name}"] = self.adam.first[name].numpy()
+            first = self.adam.first[name]
+            # numpy has no bfloat16.
+            bits = first.view(torch.uint16) if first.dtype == torch.bfloat16 else first
+            result[f"first.{name}"] = bits.numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
         result |= self.density.arrays() | self.cameras.arrays()
         if self.appearance is not None:
@@ -197,7 +200,8 @@ class TrainState:
         self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians, self.adam.options, self.adam.backend)
         for name in self.gaussians.tensors():
-            self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
+            first = torch.from_numpy(arrays[f"first.{name}"])
+            self.adam.first[name] = first.view(self.adam.first[name].dtype)
             self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
         self.adam.last = torch.from_numpy(arrays["last"])
         self.density.restore(arrays)

@@ -169,7 +169,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     if (adam) {
         const splat::AdamSettings s = settings_from(*adam);
         sh_adam.emplace(
-            splat::ShAdamState{mutable_floats(sh), mutable_floats(*exp_avg),
+            splat::ShAdamState{mutable_floats(sh),
+                               static_cast<uint16_t*>(exp_avg->mutable_data_ptr()),
                                mutable_floats(*exp_avg_sq), last->mutable_data_ptr<int32_t>()},
             splat::ShAdamSettings{s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step});
     }

@@ -148,6 +148,13 @@ MUTANTS: dict[str, Mutant] = {
         "what Adam would have done out of view never made good",
         _LOSS,
     ),
+    "moments_truncated": Mutant(
+        f"{_CSRC}/bfloat16.h",
+        "(bits + 0x7fffu + (bits >> 16 & 1u)) >> 16",
+        "bits >> 16",
+        "first moments of SH are rounded towards zero",
+        _LOSS,
+    ),
     "short_reach": Mutant(
         f"{_CSRC}/project.cpp",
         "kMostReach = 3.34",

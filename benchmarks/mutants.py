@@ -121,9 +121,9 @@ MUTANTS: dict[str, Mutant] = {
         _LOSS,
     ),
     "adam_bias": Mutant(
-        f"{_CSRC}/adam.cpp",
-        "std::pow(s.beta2, double(s.step))",
-        "std::pow(s.beta2, double(s.step + 1))",
+        f"{_CSRC}/adam.h",
+        "std::pow(beta2, double(step))",
+        "std::pow(beta2, double(step + 1))",
         "Adam's bias correction one step late",
         _LOSS,
     ),
@@ -241,8 +241,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "exposure_gradient": Mutant(
         "pipeline/training/losses/color.py",
-        "            d_color = self.backend.scale_colors(d_color, factor, self.threads)\n",
-        "            pass\n",
+        "            factor=self.light_factor(view.index, view.factor),\n",
+        "",
         "exposure left out of the gradient",
         ("tests/training/loop/test_first_step.py",),
     ),

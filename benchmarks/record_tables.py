@@ -365,14 +365,18 @@ def serial_table(found: Sequence[SerialResult]) -> str:
     rows = [
         [
             *("Gaussians", "phase", "1 thread (ms)", "n threads (ms)", "n", "speed-up"),
-            *("1 thread beside copies (ms)", "serial, of the step", "serial against copies"),
+            *(
+                "all n threads without waits (ms)",
+                "serial part",
+                "serial part without memory traffic",
+            ),
         ]
     ]
     for r in found:
         times = (f"{r.one_ms:.2f}", f"{r.many_ms:.2f}", str(r.threads))
         speed_up = f"{r.one_ms / r.many_ms:.2f}" if r.many_ms else ""
-        shares = (f"{r.share:.1%}", f"{r.code_share:.1%}")
-        rows.append([r.scene, r.phase, *times, speed_up, f"{r.beside_ms:.2f}", *shares])
+        shares = (f"{r.share:.1%}", f"{r.waiting_share:.1%}")
+        rows.append([r.scene, r.phase, *times, speed_up, f"{r.busy_ms:.2f}", *shares])
     return markdown.table(rows)
 
 
@@ -383,7 +387,7 @@ def forecast_table(found: Sequence[SerialResult]) -> str:
     for r in found:
         if r.phase != STEP:
             continue
-        for name, share in (("of all", r.share), ("against copies", r.code_share)):
+        for name, share in (("of all", r.share), ("without memory traffic", r.waiting_share)):
             serial = max(0.0, share)
             speed_ups = (f"{1 / (serial + (1 - serial) / n):.1f}" for n in cores)
             rows.append([r.scene, name, f"{share:.1%}", *speed_ups])

@@ -656,8 +656,7 @@ class SerialResult:
     Attributes:
         phase: ``STEP`` for the sum of all phases.
         one_ms, many_ms: The time of the phase in a step, on one thread and on ``threads``.
-        beside_ms: The time on one thread while the other threads run copies of the program, with
-            which it shares memory bandwidth and caches, but no state.
+        busy_ms: The time of all ``threads`` together in ``many_ms`` while they do not wait.
         step_ms: The time of the step on one thread.
     """
 
@@ -666,21 +665,20 @@ class SerialResult:
     phase: str
     one_ms: float
     many_ms: float
-    beside_ms: float
+    busy_ms: float
     step_ms: float
 
-    def serial_ms(self, alone: float) -> float:
-        """The serial part by Amdahl's law, T(n) = serial + (T(1) - serial) / n, where T(1) is the
-        time ``alone``."""
-        return (self.threads * self.many_ms - alone) / (self.threads - 1)
+    def serial_ms(self, work: float) -> float:
+        """The serial part by Amdahl's law, T(n) = serial + (work - serial) / n."""
+        return (self.threads * self.many_ms - work) / (self.threads - 1)
 
     @property
     def share(self) -> float:
-        """The serial part over the step, both on one thread alone."""
+        """The serial part over the step on one thread, if the work is that of one thread."""
         return self.serial_ms(self.one_ms) / self.step_ms
 
     @property
-    def code_share(self) -> float:
-        """The same without what threads lose to each other's memory traffic: against the time
-        beside the copies."""
-        return self.serial_ms(self.beside_ms) / self.step_ms
+    def waiting_share(self) -> float:
+        """The same if the work is that of all threads while they do not wait: what they lose to
+        each other's memory traffic is no serial part."""
+        return self.serial_ms(self.busy_ms) / self.step_ms

@@ -2,30 +2,30 @@
 
     python -m benchmarks.serial --gaussians 200000 --size 640 400 --json FILE
 
-Trains a synthetic scene from the middle of the schedule, with density control, by trainers in
-turns: on one thread, on ``--threads``, and on one thread while other processes do the same, so that
-all threads are busy. All compute the same bits, so that each turn
-is the same work, and so is each repeat of the whole measurement. Times are medians over the repeats
-of a turn in which other programs took less than 4 % of one core, or the repeat in which they took
-least. Kernels are timed one by one. The rest of a step, in Python and torch, runs on one thread.
+Trains a synthetic scene from the middle of the schedule, with density control, by two trainers in
+turns: on one thread and on ``--threads``. Both compute the same bits, so that each turn is the same
+work, and so is each repeat of the whole measurement. A turn has the steps from one densification
+to the next. Times are medians over the repeats of a turn in which other programs took less than 4 %
+of one core, or the repeat in which they took least.
+Kernels are timed one by one. The rest of a step, in Python and torch, runs on one thread.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import statistics
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing.synchronize import Barrier, Event
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
 import torch
@@ -41,60 +41,103 @@ from pipeline.render.cpu import backend as cpu
 from pipeline.runtime.torch_threads import single_torch_thread
 from pipeline.scene.exposure import ViewLight
 from pipeline.scene.views import View, scene_extent
+from pipeline.splats import rows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
+from pipeline.training.density.gradient import GradientDensity
 from pipeline.training.loop.setup import initial_state, load_scene
 from pipeline.training.loop.trainer import Trainer
 from pipeline.training.run import TrainingRun
 
 VIEWS = 48
-TURN = 10  # steps; the steps between two densifications are a multiple
 KERNELS = {
     "project": "projection, SH",
     "bin": "bin",
     "blend": "blend",
     "l1_ssim": "loss",
     "blend_backward": "blend backward",
-    "project_backward": "projection, SH backward",
-    "frame_adam": "Adam",
-    "adam_step": "Adam",
-    "observe_gradients": "density statistics",
-    "scale_colors": "light",
-    "mean_squared_error": "PSNR",
+    "project_backward_update": "projection backward, Adam",
 }
 CONTROL, REST = "density control", "other Python and torch"
 ORDER = (*dict.fromkeys(KERNELS.values()), CONTROL, REST)
-Seconds = dict[str, float]
-# The time that other programs ran in a turn, over its wall time. Turns below the limit are quiet.
-OTHERS, QUIET = "other programs", 0.04
+# The time that other programs run, over the time on the clock, in a turn that counts as quiet.
+QUIET = 0.04
 SAMPLE = 0.5  # seconds for which other programs are watched before a turn
 
 
+@dataclass(frozen=True)
+class Time:
+    """A time on the clock, and that of all threads together while they do not wait."""
+
+    wall: float = 0.0
+    busy: float = 0.0
+
+    @staticmethod
+    def now() -> Time:
+        wall, (loops, threads) = time.perf_counter(), cpu._ops().loop_time()
+        return Time(wall, wall - loops + threads - Pool.loops + Pool.threads)
+
+    def __add__(self, other: Time) -> Time:
+        return Time(self.wall + other.wall, self.busy + other.busy)
+
+    def __sub__(self, other: Time) -> Time:
+        return Time(self.wall - other.wall, self.busy - other.busy)
+
+
+class Pool(ThreadPoolExecutor):
+    """The pool that searches and copies rows (``for_ranges``).
+
+    Attributes:
+        loops, threads: The seconds of all pools together, and of their threads at work.
+    """
+
+    loops = threads = 0.0
+
+    def __enter__(self) -> Self:
+        self._start = time.perf_counter()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        Pool.loops += time.perf_counter() - self._start
+
+    def map(  # type: ignore[override]
+        self, work: Callable[..., Any], *items: Any
+    ) -> Iterator[Any]:
+        def timed(*item: Any) -> tuple[Any, float]:
+            start = time.perf_counter()
+            return work(*item), time.perf_counter() - start
+
+        for found, seconds in super().map(timed, *items):
+            Pool.threads += seconds
+            yield found
+
+
 class Phases:
-    """Adds up the seconds of phases, each without the phases inside it."""
+    """Adds up the times of phases, each without the phases inside it."""
 
     def __init__(self) -> None:
-        self.seconds: Seconds = defaultdict(float)
-        self._inside = [0.0]
+        self.times: dict[str, Time] = defaultdict(Time)
+        self._inside = [Time()]
 
     def timed(self, phase: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """The same function, measured as this phase."""
 
         def run(*args: Any, **kwargs: Any) -> Any:
-            self._inside.append(0.0)
-            start = time.perf_counter()
+            self._inside.append(Time())
+            start = Time.now()
             try:
                 return call(*args, **kwargs)
             finally:
-                seconds = time.perf_counter() - start
-                self.seconds[phase] += seconds - self._inside.pop()
-                self._inside[-1] += seconds
+                taken = Time.now() - start
+                self.times[phase] += taken - self._inside.pop()
+                self._inside[-1] += taken
 
         return run
 
-    def take(self) -> Seconds:
-        """The seconds since the last call."""
-        taken, self.seconds = dict(self.seconds), defaultdict(float)
+    def take(self) -> dict[str, Time]:
+        """The times since the last call."""
+        taken, self.times = dict(self.times), defaultdict(Time)
         return taken
 
 
@@ -110,72 +153,84 @@ class Run:
                 for name, phase in KERNELS.items()
             },
             release_memory=cpu._ops().release_memory,
+            loop_time=cpu._ops().loop_time,
         )
         scene = load_scene(inputs, run, print)
         state = initial_state(scene, run, backend, print)
         state.gaussians = state.gaussians.with_sh_degree(options.sh_degree)
         state.adam.resize_bands(options.sh_degree)
         state.step = state.clock = options.steps // 3
+        assert isinstance(state.density, GradientDensity)
+        self.interval = state.density.timeline.interval
         self.trainer = trainer = Trainer(scene, state, run, backend)
         timed = self.phases.timed
         vars(trainer)["control_density"] = timed(CONTROL, trainer.control_density)
         self._timed_step = timed(REST, trainer.step)
 
     def step(self) -> None:
-        with mock.patch.object(cpu, "_ops", lambda: self._operators):
+        with (
+            mock.patch.object(cpu, "_ops", lambda: self._operators),
+            mock.patch.object(rows, "ThreadPoolExecutor", Pool),
+        ):
             self._timed_step()
 
-    def turn(self) -> Seconds:
-        """Run ``TURN`` steps, and return the seconds of each phase."""
-        start, busy = time.perf_counter(), busy_seconds()
-        for _ in range(TURN):
+    def turn(self) -> Turn:
+        """Run the steps from one densification to the next."""
+        start, others = time.perf_counter(), others_seconds()
+        for _ in range(self.interval):
             self.step()
-        others = (busy_seconds() - busy) / (time.perf_counter() - start)
-        return self.phases.take() | {OTHERS: others}
+        share = (others_seconds() - others) / (time.perf_counter() - start)
+        scale = 1e3 / self.interval
+        times = self.phases.take().items()
+        return Turn({phase: Time(scale * t.wall, scale * t.busy) for phase, t in times}, share)
 
 
-def busy_seconds() -> float:
+@dataclass(frozen=True)
+class Turn:
+    """The mean times of the phases of a step, milliseconds, and the share of it in which other
+    programs ran."""
+
+    times: Mapping[str, Time]
+    others: float
+
+
+def others_seconds() -> float:
     """The processor time that all programs but this one, and other virtual machines, have taken."""
     user, nice, system, _, _, *rest = map(int, Path("/proc/stat").read_text().split()[1:9])
     return (user + nice + system + sum(rest)) / os.sysconf("SC_CLK_TCK") - time.process_time()
 
 
 def once(
-    inputs: Inputs,
-    options: TrainOptions,
-    copies: Copies,
-    threads: int,
-    turns: int,
-    wait: Callable[[], None],
-) -> Iterator[list[Seconds]]:
-    """The seconds of each turn after the first: on one thread, on ``threads``, and on one thread
-    beside the copies. ``wait`` is called before each turn."""
+    inputs: Inputs, options: TrainOptions, threads: int, turns: int, wait: Callable[[], None]
+) -> Iterator[list[Turn]]:
+    """Each turn after the first, on one thread and on ``threads``. ``wait`` is called before each
+    of them."""
     with TemporaryDirectory() as folder:
-        one, many, beside = (
-            Run(inputs, options, Path(folder), number) for number in (1, threads, 1)
-        )
-        for turn in range(turns + 1):
-            wait()
-            seconds = [one.turn(), many.turn()]
-            with copies.running():
-                seconds.append(beside.turn())
-            seconds[-1][OTHERS] -= threads - 1
-            if turn:
-                yield seconds
+        trainers = [Run(inputs, options, Path(folder), number) for number in (1, threads)]
+        for number in range(turns + 1):
+            found = []
+            for trainer in trainers:
+                wait()
+                found.append(trainer.turn())
+            if number:
+                yield found
 
 
-def medians(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> list[Seconds]:
+def medians(repeats: Sequence[Sequence[Sequence[Turn]]]) -> list[dict[str, Time]]:
     """The milliseconds of each phase in a step, at each number of threads: the median over the
     quiet repeats of each turn, and the mean over the turns."""
-    found: list[Seconds] = []
+    found: list[dict[str, Time]] = []
     for number in range(len(repeats[0][0])):
-        phases: Seconds = defaultdict(float)
+        phases: dict[str, Time] = defaultdict(Time)
         for same in zip(*repeats, strict=True):
-            found_here = sorted((turn[number] for turn in same), key=lambda turn: turn[OTHERS])
-            quiet = [turn for turn in found_here if turn[OTHERS] < QUIET] or found_here[:1]
+            turns = sorted((turn[number] for turn in same), key=lambda turn: turn.others)
+            quiet = [turn for turn in turns if turn.others < QUIET] or turns[:1]
             for phase in ORDER:
-                here = [turn.get(phase, 0.0) for turn in quiet]
-                phases[phase] += 1e3 * statistics.median(here) / TURN / len(repeats[0])
+                times = [turn.times.get(phase, Time()) for turn in quiet]
+                phases[phase] += Time(
+                    statistics.median(time.wall for time in times) / len(repeats[0]),
+                    statistics.median(time.busy for time in times) / len(repeats[0]),
+                )
         found.append(phases)
     return found
 
@@ -184,70 +239,33 @@ def wait_for_quiet(seconds: float) -> float:
     """Wait until other programs hardly run, for ``seconds`` at most; return the seconds left."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
-        busy = busy_seconds()
+        others = others_seconds()
         time.sleep(SAMPLE)
-        if busy_seconds() - busy < QUIET * SAMPLE:
+        if others_seconds() - others < QUIET * SAMPLE:
             return left
     return 0.0
 
 
-def quiet_share(repeats: Sequence[Sequence[Sequence[Seconds]]]) -> float:
+def quiet_share(repeats: Sequence[Sequence[Sequence[Turn]]]) -> float:
     """The share of the turns' repeats in which other programs hardly ran."""
-    every = [run[OTHERS] < QUIET for turns in repeats for turn in turns for run in turn]
+    every = [turn.others < QUIET for turns in repeats for both in turns for turn in both]
     return sum(every) / len(every)
-
-
-class Copies:
-    """Other processes that train the same scene on one thread each: with this one, a perfectly
-    parallel program of the same arithmetic without shared state.
-
-    Args:
-        count: The number of processes.
-        arguments: Those of ``copy``.
-    """
-
-    def __init__(self, count: int, arguments: tuple[int, int, int]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._go, started = context.Event(), context.Barrier(count + 1)
-        self._processes = [
-            context.Process(target=copy, args=(*arguments, self._go, started), daemon=True)
-            for _ in range(count)
-        ]
-        for process in self._processes:
-            process.start()
-        started.wait()
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Let them train inside."""
-        self._go.set()
-        yield
-        self._go.clear()
-        time.sleep(SAMPLE)  # Their steps end.
-
-
-def copy(count: int, width: int, height: int, go: Event, started: Barrier) -> None:
-    """Train while ``go`` is set."""
-    torch.set_num_threads(1)
-    with made_scene(count, width, height) as inputs, TemporaryDirectory() as folder:
-        run = Run(inputs, made_options(count), Path(folder), 1)
-        started.wait()
-        while True:
-            go.wait()
-            run.step()
 
 
 def made_options(count: int) -> TrainOptions:
     return TrainOptions(density=Gradient(max_gaussians=count))
 
 
-def results(scene: str, threads: int, times: Sequence[Mapping[str, float]]) -> list[SerialResult]:
-    """A result for each phase and the step, of the times in the order of ``SerialResult``."""
-    one, many, beside = ({**phases, STEP: sum(phases.values())} for phases in times)
+def results(scene: str, threads: int, found: Sequence[Mapping[str, Time]]) -> list[SerialResult]:
+    """A result for each phase and the step, of the times on one thread and on ``threads``."""
+    one, many = ({**phases, STEP: sum(phases.values(), Time())} for phases in found)
     return [
-        SerialResult(scene, threads, phase, one[phase], many[phase], beside[phase], one[STEP])
+        SerialResult(
+            scene, threads, phase, one[phase].wall, many[phase].wall, many[phase].busy,
+            one[STEP].wall,
+        )
         for phase in (*ORDER, STEP)
-    ]
+    ]  # fmt: skip
 
 
 def made_inputs(gaussians: Gaussians, views: list[View]) -> Inputs:
@@ -270,7 +288,9 @@ def main() -> int:
     parser.add_argument("--gaussians", type=int, default=200_000)
     parser.add_argument("--size", type=int, nargs=2, default=[640, 400], metavar=("W", "H"))
     parser.add_argument("--threads", type=int, default=2, help="against one thread")
-    parser.add_argument("--steps", type=int, default=200, help="of each trainer and repeat")
+    parser.add_argument(
+        "--turns", type=int, default=3, help="densifications of each trainer and repeat"
+    )
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument(
         "--wait", type=float, default=0.0, help="seconds to wait in all until other programs pause"
@@ -278,17 +298,15 @@ def main() -> int:
     add_record_options(parser)
     args = parser.parse_args()
     repeats, left = [], args.wait
-    options, made = made_options(args.gaussians), (args.gaussians, *args.size)
-    copies = Copies(args.threads - 1, made)
+    options = made_options(args.gaussians)
 
     def wait() -> None:
         nonlocal left
         left = wait_for_quiet(left)
 
-    with made_scene(*made) as inputs, single_torch_thread():
+    with made_scene(args.gaussians, *args.size) as inputs, single_torch_thread():
         for _ in range(args.repeats):
-            turns = once(inputs, options, copies, args.threads, args.steps // TURN, wait)
-            repeats.append(list(turns))
+            repeats.append(list(once(inputs, options, args.threads, args.turns, wait)))
     scene = f"{args.gaussians} at {args.size[0]}x{args.size[1]}"
     found = results(scene, args.threads, medians(repeats))
     print(f"{serial_table(found)}\n{forecast_table(found)}")

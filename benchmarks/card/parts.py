@@ -15,7 +15,7 @@ import torch
 from benchmarks.card.peak import arithmetic
 from benchmarks.gpu import bandwidth, measure, median_seconds
 from benchmarks.light import first_of, read_scene
-from benchmarks.raster.measure import MIN_TURNS, Cost, Step, contributing_pairs
+from benchmarks.raster.measure import MIN_TURNS, Step, contributing_pairs
 from benchmarks.raster.scenes import Scene, synthetic, trained
 from pipeline.config.density import Gradient
 from pipeline.config.schema import Split
@@ -26,7 +26,7 @@ from pipeline.photos.load import load_rgb
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.calibration import StepScene, training_step
 from pipeline.render.cpu import build
-from pipeline.render.gpu import layout, rasterise
+from pipeline.render.gpu import rasterise
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.registry import use_device
@@ -38,8 +38,6 @@ from pipeline.training.scene import train_scene
 
 RADIUS = 5.0  # The mean 3-sigma radius of synthetic Gaussians, pixels.
 FRAMES = 20  # The number of frames between two copies.
-# The phase of ``benchmarks.gpu`` for two operators of ``benchmarks.raster.measure``.
-FUSED, OPERATORS = "projection backward, Adam", ("projection, SH backward", "Adam")
 
 Figures = dict[str, float]
 Facts = dict[str, str]
@@ -107,13 +105,6 @@ def step(case: Case) -> Found:
     found, flops = measure(scene, backend, case.turns), arithmetic(backend.gpu)
     on_cpu = Step(scene, usable_cores())
     costs = on_cpu.costs(contributing_pairs(on_cpu))
-    of_operators = [costs[name] for name in OPERATORS]
-    # Gradients of the geometry stay in registers, and the geometry is read once.
-    geometry = 3 * 4 * layout.floats(layout.GEOMETRY) * scene.count
-    costs[FUSED] = Cost(
-        sum(cost.flops for cost in of_operators),
-        sum(cost.bytes for cost in of_operators) - geometry,
-    )
     figures = {
         "step_ms": found.step_ms,
         "cpu_step_ms": found.cpu_step_ms,

@@ -117,7 +117,7 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
 def main(arguments: Sequence[str]) -> int:
     options = _arguments(arguments)
     deadline = time.monotonic() + 60 * options.minutes
-    if not (options.pack / "scene" / "point_cloud.ply").is_file():
+    if not (options.pack / "scene" / "point_cloud.spz").is_file():
         print(f"error: {options.pack}: expected a folder of benchmarks.card.pack", file=sys.stderr)
         return EXIT_USER_ERROR
     pack = options.pack.resolve()

@@ -89,14 +89,18 @@ class Step:
         gen = torch.Generator().manual_seed(1)
         target = torch.rand(*self.drawn.color.shape, generator=gen)
         params = [g.clone() for g in p.inputs]
-        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
-        turns = torch.zeros(scene.count, 3), torch.zeros(scene.count, 3)
+        means, log_scales, _, opacity_logits, sh = params
+        # Those of rotations are about three axes.
+        shapes = means, means, log_scales, opacity_logits, sh
+        moments = [torch.zeros_like(like) for like in shapes for _ in range(2)]
         last = torch.zeros(scene.count, dtype=torch.int32)
         # The learning rates are 0, so that every repeat renders the same.
         rate = torch.tensor([1, 0.8, 0.999, 1e-15, 0], dtype=torch.float64)
         rates = torch.tensor([1, 0.8, 0.999, 1e-15, 0, 0], dtype=torch.float64)
-        loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
-        self.d_color = kernels.l1_ssim(*loss_of)[3]
+        statistics = torch.zeros(scene.count), torch.zeros(scene.count)
+        images = self.drawn.color, None, target, None
+        loss_of = (*images, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
+        self.d_color = kernels.l1_ssim(*loss_of)[4]
         kept: dict[str, Any] = {}
 
         def project() -> None:
@@ -118,19 +122,10 @@ class Step:
             )  # fmt: skip
 
         def project_backward() -> None:
-            kept["gradients"] = kernels.project_backward(
-                *p.inputs, p.view, p.records, p.radii, s.slots, kept["slots"], False, False,
-                *moments[4], last, rates, threads,
+            kernels.project_backward_update(
+                *params, p.view, p.records, p.radii, s.slots, kept["slots"], moments, last,
+                [rates, rate, rate, rates], *statistics, False, False, threads,
             )  # fmt: skip
-
-        def adam() -> None:
-            d_means, d_log_scales, d_quats, d_opacity_logits = kept["gradients"][:4]
-            kernels.frame_adam(
-                params[0], params[2], params[1], d_means, d_quats, *moments[0], *turns, rates,
-                threads,
-            )  # fmt: skip
-            for k, grad in ((1, d_log_scales), (3, d_opacity_logits)):
-                kernels.adam_step(params[k], grad, *moments[k], rate, threads)
 
         self.operators: dict[str, Callable[[], None]] = {
             "projection, SH": project,
@@ -138,8 +133,7 @@ class Step:
             "blend": blend,
             "loss": loss,
             "blend backward": blend_backward,
-            "projection, SH backward": project_backward,  # and the harmonics' Adam
-            "Adam": adam,
+            "projection backward, Adam": project_backward,
         }
 
     def costs(self, pairs: int) -> dict[str, Cost]:
@@ -158,12 +152,11 @@ class Step:
             "blend": Cost(28 * pairs, visible * record + tiles * entry + 16 * pixels),
             "loss": Cost(loss, 36 * pixels),
             "blend backward": Cost(56 * pairs, tiles * (entry + slot) + 28 * pixels),
-            # SH coefficients and their moments are read and written for Gaussians in view.
-            "projection, SH backward": Cost(
-                n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
+            # Parameters and their moments are read and written, those of SH for Gaussians in view.
+            # Quaternions have moments of 3 floats.
+            "projection backward, Adam": Cost(
+                n * 800, n * (6 * (row - sh) - 4 * 4 + 2 * 8) + 6 * visible * sh + tiles * slot
             ),
-            # Quaternions have moments of 3 floats; the scales are read once more.
-            "Adam": Cost(0, 7 * n * (row - sh) - 4 * 4 * n + 3 * 4 * n),
         }
 
     def once(self) -> dict[str, Timing]:

@@ -12,6 +12,7 @@ import torch
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model
 from pipeline.io.ply import read_splat_ply
+from pipeline.io.spz import read_spz
 from pipeline.render import RasterCamera
 from pipeline.splats.morton import morton_order
 
@@ -83,9 +84,11 @@ def synthetic(count: int, width: int, height: int, radius: float, in_view: float
 
 
 def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
-    """An export folder: its ``point_cloud.ply`` seen by the images of its ``sparse/0``. Every image
-    is stretched to ``size`` (width, height), or to the size of the first one."""
-    arrays = read_splat_ply(folder / "point_cloud.ply")
+    """An export folder: its ``point_cloud.ply``, or without it ``point_cloud.spz``, seen by the
+    images of its ``sparse/0``. Every image is stretched to ``size`` (width, height), or to the size
+    of the first one."""
+    file = folder / "point_cloud.ply"
+    arrays = read_splat_ply(file) if file.exists() else read_spz(file.with_suffix(".spz"))
     model = read_model(folder / "sparse" / "0")
     posed = sorted(model.images.values(), key=lambda image: image.name)
     lens = model.cameras[posed[0].camera_id]

@@ -19,7 +19,9 @@ from pipeline.render.types import (
     Color,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
+    ImageGradients,
     LossResult,
     Moments,
     RasterCamera,
@@ -27,6 +29,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +44,9 @@ __all__ = [
     "Color",
     "Forward",
     "FrameMoments",
+    "GaussianAdam",
     "Gradients",
+    "ImageGradients",
     "LossResult",
     "Moments",
     "RasterCamera",
@@ -49,6 +54,7 @@ __all__ = [
     "ShAdam",
     "Subset",
     "Surroundings",
+    "ViewGradients",
     "make_backend",
 ]
 

@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from pipeline.render import checks
@@ -23,7 +22,9 @@ from pipeline.render.types import (
     AlphaChangeLoss,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
+    ImageGradients,
     LossResult,
     Moments,
     RasterCamera,
@@ -31,6 +32,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 
 
@@ -124,6 +126,8 @@ class Backend(ABC, Generic[Projected, Binned]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
         """The loss (1 - w) E + w (1 - SSIM) and its gradient with respect to the rendered image.
 
@@ -137,19 +141,8 @@ class Backend(ABC, Generic[Projected, Binned]):
                 by the target there, and both means are over the other pixels.
             l2_weight: k >= 0.
             threads: The number of threads, 0 for all.
+            factor: (3,) or (H, W, 3) float32, of the rendered image; None: 1.
         """
-
-    def mean_squared_error(
-        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
-    ) -> float:
-        """The mean squared error of the images of ``l1_ssim`` without ignored pixels; 0 if all
-        are ignored."""
-        rendered, target, mask = checks.images(rendered, target, mask)
-        scale = 255.0 if target.dtype == torch.uint8 else 1.0
-        difference = rendered.double() - (target.float() / scale).double()
-        if mask is not None:
-            difference = difference[mask == 0]
-        return float(difference.square().mean()) if difference.numel() else 0.0
 
     @abstractmethod
     def compose(
@@ -229,9 +222,34 @@ class Backend(ABC, Generic[Projected, Binned]):
         gradient_sum += (gradients.means2d * scale).double().norm(dim=1).float()
         seen += rendered.radii > 0
 
-    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
-        """The product of ``image`` (H, W, 3) and ``factor`` (3,) or (H, W, 3), float32."""
-        return image * factor
+    def update(
+        self,
+        fwd: Forward,
+        parameters: Parameters,
+        gradients: ImageGradients,
+        *,
+        adam: GaussianAdam,
+        statistics: tuple[Tensor, Tensor] | None = None,
+        colors: bool = False,
+        camera: bool = False,
+    ) -> ViewGradients:
+        """``backward``, and then one step of Adam over all parameters, in place. A backend may do
+        both at once, without storing gradients.
+
+        Args:
+            parameters: Those of ``forward``, contiguous.
+            statistics: ``gradient_sum`` and ``seen`` of ``observe_gradients``, to which the step is
+                added.
+        """
+        checks.check_update(parameters, adam, statistics, len(fwd.radii))
+        means, log_scales, quats, opacity_logits, _ = parameters
+        g = self.backward(fwd, *gradients, colors=colors, camera=camera, sh_adam=adam.sh)
+        if statistics is not None:
+            self.observe_gradients(fwd, g, *statistics)
+        self.frame_adam(means, quats, log_scales, g.means, g.quats, adam.frames, adam.frame_rates)
+        self.adam_step(log_scales, g.log_scales, adam.log_scales, adam.log_scale_rates)
+        self.adam_step(opacity_logits, g.opacity_logits, adam.opacity_logits, adam.opacity_rates)
+        return ViewGradients(g.colors, g.camera)
 
     def forward(
         self,

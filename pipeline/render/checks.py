@@ -11,6 +11,7 @@ from torch import Tensor
 from pipeline.render.types import (
     AdamRates,
     FrameMoments,
+    GaussianAdam,
     Moments,
     RasterCamera,
     ShAdam,
@@ -93,9 +94,10 @@ def image_gradients(
 
 
 def images(
-    rendered: Tensor, target: Tensor, mask: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The images of a loss, checked: rendered (H, W, 3), target float32 or uint8, mask uint8."""
+    rendered: Tensor, target: Tensor, mask: Tensor | None, factor: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    """The images of a loss, checked: rendered (H, W, 3), target float32 or uint8, mask uint8, and
+    the factor of the rendered image."""
     rendered = checked("rendered", rendered, (None, None, 3))
     size = tuple(rendered.shape)
     if target.dtype == torch.uint8 and tuple(target.shape) == size:
@@ -108,7 +110,9 @@ def images(
                 f"mask: expected bool or uint8 {size[:2]}, found {mask.dtype} {tuple(mask.shape)}"
             )
         mask = mask.contiguous().view(torch.uint8)
-    return rendered, target, mask
+    if factor is not None:
+        factor = checked("factor", factor, (3,) if factor.dim() == 1 else size)
+    return rendered, target, mask, factor
 
 
 def layers(around: Surroundings, color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -186,6 +190,31 @@ def check_frame_adam(
             if tensor.shape != shape:
                 raise ValueError(f"frame_adam: expected {shape}, found {tuple(tensor.shape)}")
     _check_rates("frame_adam", rates, count=2)
+
+
+def check_update(
+    parameters: Parameters,
+    adam: GaussianAdam,
+    statistics: tuple[Tensor, Tensor] | None,
+    count: int,
+) -> None:
+    """Raise ValueError if the arguments of ``update`` for ``count`` Gaussians do not fit each other
+    or are invalid."""
+    means, log_scales, quats, opacity_logits, sh = parameters
+    for tensor, shape in ((means, (count, 3)), (sh, (count, None, 3))):
+        if checked("parameters", tensor, shape).data_ptr() != tensor.data_ptr():
+            raise ValueError("update: parameters must be contiguous")
+    for tensor in statistics or ():
+        checked("statistics", tensor, (count,))
+    check_frame_adam((means, quats, log_scales), (means, quats), adam.frames, adam.frame_rates)
+    for parameter, moments, rates in (
+        (log_scales, adam.log_scales, adam.log_scale_rates),
+        (opacity_logits, adam.opacity_logits, adam.opacity_rates),
+    ):
+        check_adam(parameter, parameter, moments, rates)
+        if len(rates.rates) != 1 or moments.exp_avg_sq.shape != parameter.shape:
+            raise ValueError("update: scales and opacities have one rate and moments of their own")
+    check_sh_adam(adam.sh, sh)
 
 
 def _check_rates(operator: str, rates: AdamRates, count: int | None = None) -> None:

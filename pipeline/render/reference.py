@@ -384,6 +384,17 @@ def l1_ssim(
     return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
 
 
+def mean_squared_error(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The mean squared error of the images of ``l1_ssim``, over the other pixels than the masked
+    ones; 0 if there are none."""
+    truth = target.to(rendered.dtype)
+    if target.dtype == torch.uint8:
+        truth = truth / 255
+    squares = (rendered - truth).square()
+    squares = squares if mask is None else squares[~mask.bool()]
+    return squares.mean() if squares.numel() else squares.sum()
+
+
 def compose(around: Surroundings, color: Tensor, alpha: Tensor) -> Tensor:
     """(H, W, 3) image of a scene, of which one part is rendered; see ``Backend.compose``."""
     image = color + (1 - alpha)[..., None] * around.behind / 255

@@ -156,14 +156,22 @@ class ReferenceBackend(Backend[Projected, Projected]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
-        rendered, target, mask = checks.images(rendered, target, mask)
+        rendered, target, mask, factor = checks.images(rendered, target, mask, factor)
         leaf = rendered.double().requires_grad_()
+        lit = leaf if factor is None else leaf * factor.double()
         ignored = None if mask is None else mask.bool()
-        loss, error, ssim = reference.l1_ssim(leaf, target, ssim_weight, ignored, l2_weight)
+        loss, error, ssim = reference.l1_ssim(lit, target, ssim_weight, ignored, l2_weight)
         (grad,) = torch.autograd.grad(loss, leaf)
+        squared = reference.mean_squared_error(lit, target, ignored)
         return LossResult(
-            float(loss.detach()), float(error.detach()), float(ssim.detach()), grad.float()
+            loss=float(loss.detach()),
+            error=float(error.detach()),
+            ssim=float(ssim.detach()),
+            squared_error=float(squared.detach()),
+            grad=grad.float(),
         )
 
     def compose(

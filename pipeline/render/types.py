@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -281,11 +281,51 @@ class ShAdam:
     rates: AdamRates
 
 
+class ImageGradients(NamedTuple):
+    """The gradients of ``Backend.backward`` on the images: (H, W, 3) of the colours, (H, W) of
+    alpha and depth; float32."""
+
+    color: Tensor
+    alpha: Tensor | None = None
+    depth: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class GaussianAdam:
+    """Adam over all parameters of Gaussians (``Backend.update``).
+
+    Attributes:
+        frames, frame_rates: Those of ``Backend.frame_adam``.
+        log_scales, log_scale_rates: Those of ``Backend.adam_step`` for the scales, with one rate.
+        opacity_logits, opacity_rates: The same for the opacities.
+        sh: Those of the SH coefficients.
+    """
+
+    frames: FrameMoments
+    frame_rates: AdamRates
+    log_scales: Moments
+    log_scale_rates: AdamRates
+    opacity_logits: Moments
+    opacity_rates: AdamRates
+    sh: ShAdam
+
+
+@dataclass(frozen=True)
+class ViewGradients:
+    """The gradients that ``Backend.update`` leaves to its caller: ``Gradients.colors`` and
+    ``Gradients.camera``."""
+
+    colors: Tensor | None
+    camera: CameraGradients | None
+
+
 @dataclass(frozen=True)
 class LossResult:
-    """loss = (1 - w) error + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
+    """loss = (1 - w) error + w (1 - ssim), its parts, the mean squared error (0 if all pixels are
+    ignored), and dL/d(rendered) (H, W, 3) float32."""
 
     loss: float
     error: float
     ssim: float
+    squared_error: float
     grad: Tensor

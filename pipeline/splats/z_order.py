@@ -24,19 +24,25 @@ def z_order(means: NDArray[Any], threads: int = 1) -> NDArray[np.intp]:
     code = np.empty(len(means), np.int64)
 
     def encode(rows: slice) -> None:
-        x, y, z = ((means[rows] - low) / size * (2**_BITS - 1)).astype(np.int64).T
-        code[rows] = _spread(x) | _spread(y) << 1 | _spread(z) << 2
+        cells = means[rows].T.astype(np.float64, order="C")
+        cells -= low[:, None]
+        cells /= size[:, None]
+        cells *= 2**_BITS - 1
+        x, y, z = _spread(cells.astype(np.int64))
+        code[rows] = x | y << 1 | z << 2
 
     for_ranges(len(means), threads, encode)
     return np.argsort(code, kind="stable")
 
 
 def _bounds(means: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    return means.min(0), means.max(0)
+    # By columns: numpy reduces the first axis of three values twenty times slower.
+    columns = means.T
+    return np.array([x.min() for x in columns]), np.array([x.max() for x in columns])
 
 
 def _spread(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Insert two zero bits before each of the 21 bits of (N,) values."""
+    """Insert two zero bits before each of the 21 bits of the values, in place."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -44,5 +50,6 @@ def _spread(values: NDArray[np.int64]) -> NDArray[np.int64]:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        values = (values | values << shift) & mask
+        values |= values << shift
+        values &= mask
     return values

@@ -49,10 +49,36 @@ def test_loss_equals_the_reference(
     assert found.loss == pytest.approx(loss.item(), abs=1e-6)
     assert found.error == pytest.approx(error.item(), abs=1e-6)
     assert found.ssim == pytest.approx(ssim.item(), abs=1e-6)
+    squared = reference.mean_squared_error(leaf, target, None if use is None else mask)
+    assert found.squared_error == pytest.approx(squared.item(), rel=1e-5)
     assert found.grad.dtype == torch.float32
     assert relative(found.grad, grad) <= 1e-5
     if use is not None:
         assert not found.grad[mask].any()
+
+
+@pytest.mark.parametrize("shape", [(3,), (40, 53, 3)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_factor_is_that_of_the_rendered_image(
+    any_backend: Backend, shape: tuple[int, ...], masked: bool
+) -> None:
+    rendered, target = images(40, 53)
+    factor = 1 + 0.2 * normal(*shape, seed=3)
+    mask = torch.rand(40, 53, generator=torch.Generator().manual_seed(5)) > 0.7 if masked else None
+    found = any_backend.l1_ssim(rendered, target, 0.2, mask, 2.5, factor=factor)
+    leaf = rendered.double().requires_grad_()
+    lit = leaf * factor.double()
+    loss, _, _ = reference.l1_ssim(lit, target, 0.2, mask, 2.5)
+    (grad,) = torch.autograd.grad(loss, leaf)
+    squared = reference.mean_squared_error(lit, target, mask)
+    assert found.loss == pytest.approx(loss.item(), abs=1e-6)
+    assert found.squared_error == pytest.approx(squared.item(), rel=1e-5)
+    assert relative(found.grad, grad) <= 1e-5
+
+
+def test_a_factor_of_another_size_is_an_error(backend: Backend) -> None:
+    with pytest.raises(ValueError, match="factor"):
+        backend.l1_ssim(*images(9, 9), 0.2, factor=torch.ones(9, 8, 3))
 
 
 def test_loss_of_flat_images_is_accurate(backend: Backend) -> None:
@@ -90,7 +116,7 @@ def test_ssim_equals_scikit_image_away_from_the_border(backend: Backend) -> None
 def test_the_loss_of_a_fully_masked_image_is_zero(backend: Backend) -> None:
     rendered, target = images(9, 9)
     found = backend.l1_ssim(rendered, target, 0.2, torch.ones(9, 9, dtype=torch.bool))
-    assert found.loss == 0 and not found.grad.any()
+    assert found.loss == 0 and found.squared_error == 0 and not found.grad.any()
 
 
 def test_masked_pixels_may_have_any_value(backend: Backend) -> None:

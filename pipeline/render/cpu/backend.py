@@ -20,7 +20,9 @@ from pipeline.render.types import (
     CameraGradients,
     Forward,
     FrameMoments,
+    GaussianAdam,
     Gradients,
+    ImageGradients,
     LossResult,
     Moments,
     RasterCamera,
@@ -28,6 +30,7 @@ from pipeline.render.types import (
     ShAdam,
     Subset,
     Surroundings,
+    ViewGradients,
 )
 from pipeline.runtime.errors import UserError
 
@@ -105,6 +108,19 @@ def _doubles(*values: float) -> Tensor:
     return torch.frombuffer(array("d", values), dtype=torch.float64)
 
 
+def _slot_gradients(
+    fwd: Forward, d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None
+) -> Tensor:
+    """(M, 16) gradients of each pair, see csrc/types.h."""
+    s: State = fwd.state
+    p = s.projected
+    d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, p.size)
+    return _ops().blend_backward(
+        p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
+        None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
+    )  # fmt: skip
+
+
 class CpuBackend(Backend[Projected, Binned]):
     """Multithreaded kernels for the vector instructions of the processor."""
 
@@ -173,18 +189,13 @@ class CpuBackend(Backend[Projected, Binned]):
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
         s: State = fwd.state
-        p, ops = s.projected, _ops()
-        d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, p.size)
-        slot_gradients = ops.blend_backward(
-            p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
-            None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
-        )  # fmt: skip
+        p, slot_gradients = s.projected, _slot_gradients(fwd, d_color, d_alpha, d_depth)
         adam: tuple[Tensor | None, ...] = None, None, None, None
         if sh_adam is not None:
             checks.check_sh_adam(sh_adam, p.inputs[4])
             moments = sh_adam.moments
             adam = moments.exp_avg, moments.exp_avg_sq, sh_adam.last, _pack_adam(sh_adam.rates)
-        found = ops.project_backward(
+        found = _ops().project_backward(
             *p.inputs, p.view, p.records, fwd.radii, s.slots, slot_gradients, colors, camera, *adam,
             p.threads,
         )  # fmt: skip
@@ -194,6 +205,37 @@ class CpuBackend(Backend[Projected, Binned]):
             CameraGradients(*d_camera.split([3, 3, 2, 2])) if camera else None,
         )  # fmt: skip
 
+    def update(
+        self,
+        fwd: Forward,
+        parameters: Parameters,
+        gradients: ImageGradients,
+        *,
+        adam: GaussianAdam,
+        statistics: tuple[Tensor, Tensor] | None = None,
+        colors: bool = False,
+        camera: bool = False,
+    ) -> ViewGradients:
+        s: State = fwd.state
+        p, slot_gradients = s.projected, _slot_gradients(fwd, *gradients)
+        checks.check_update(parameters, adam, statistics, len(fwd.radii))
+        moments = (
+            *(adam.frames.means, adam.frames.rotations),
+            *(adam.log_scales, adam.opacity_logits, adam.sh.moments),
+        )
+        rates = adam.frame_rates, adam.log_scale_rates, adam.opacity_rates, adam.sh.rates
+        gradient_sum, seen = statistics or (None, None)
+        d_colors, d_camera = _ops().project_backward_update(
+            *parameters, p.view, p.records, fwd.radii, s.slots, slot_gradients,
+            [tensor for each in moments for tensor in (each.exp_avg, each.exp_avg_sq)],
+            adam.sh.last, [_pack_adam(each) for each in rates], gradient_sum, seen, colors, camera,
+            p.threads,
+        )  # fmt: skip
+        return ViewGradients(
+            d_colors if colors else None,
+            CameraGradients(*d_camera.split([3, 3, 2, 2])) if camera else None,
+        )
+
     def l1_ssim(
         self,
         rendered: Tensor,
@@ -202,15 +244,13 @@ class CpuBackend(Backend[Projected, Binned]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
-        images = checks.images(rendered, target, mask)
-        return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
-
-    def mean_squared_error(
-        self, rendered: Tensor, target: Tensor, mask: Tensor | None = None, threads: int = 0
-    ) -> float:
-        images = checks.images(rendered, target, mask)
-        return float(_ops().mean_squared_error(*images, _threads(threads)))
+        rendered, target, mask, factor = checks.images(rendered, target, mask, factor)
+        weights = ssim_weight, l2_weight
+        found = _ops().l1_ssim(rendered, factor, target, mask, *weights, _threads(threads))
+        return LossResult(*found)
 
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
@@ -250,12 +290,6 @@ class CpuBackend(Backend[Projected, Binned]):
         height, width = rendered.alpha.shape
         tensors = means2d, rendered.radii, gradient_sum, seen
         _ops().observe_gradients(*tensors, 0.5 * width, 0.5 * height, _threads(threads))
-
-    def scale_colors(self, image: Tensor, factor: Tensor, threads: int = 0) -> Tensor:
-        image = checks.checked("image", image, (None, None, 3))
-        shape = (3,) if factor.dim() == 1 else tuple(image.shape)
-        factor = checks.checked("factor", factor, shape)
-        return _ops().scale_colors(image, factor, _threads(threads))
 
     def adam_step(
         self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0

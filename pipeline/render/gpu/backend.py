@@ -196,17 +196,22 @@ class GpuBackend(Backend[Projected, Binned]):
         mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
+        *,
+        factor: Tensor | None = None,
     ) -> LossResult:
-        rendered, target, mask = checks.images(rendered, target, mask)
+        rendered, target, mask, factor = checks.images(rendered, target, mask, factor)
+        if factor is not None:
+            rendered = rendered * factor
         gpu, (height, width, _) = self.gpu, rendered.shape
         space, image = Workspace(gpu), LossImage.upload(gpu, target, mask)
         found = l1_ssim(
             space, gpu.upload(rendered.numpy()), image, (width, height), ssim_weight, l2_weight
         )
-        error, ssim, _ = found.means(sum_rows(space, found.sums, found.rows, 4))
+        error, ssim, squared = found.means(sum_rows(space, found.sums, found.rows, 4))
         loss = (1 - ssim_weight) * error + ssim_weight * (1 - ssim)
         grad = torch.from_numpy(gpu.read(found.gradient, np.float32, rendered.numel()))
-        return LossResult(loss, error, ssim, grad.view(rendered.shape))
+        grad = grad.view(rendered.shape)
+        return LossResult(loss, error, ssim, squared, grad if factor is None else grad * factor)
 
     def compose(
         self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0

@@ -14,7 +14,7 @@ class CurveRecord(JsonObject):
 
     step: int = Field(ge=0, description="Number of optimiser steps done.")
     loss: float = Field(description="Of photometric terms.")
-    psnr: float = Field(description="Over some of the steps, dB.")
+    psnr: float = Field(description="Of the renders, dB.")
     num_gaussians: int = Field(ge=0, description="After the step.")
 
 

@@ -109,7 +109,7 @@ class DeviceStep(StepEngine):
         if state.appearance is not None and result.embedding is not None:
             gradient = np.array(result.embedding)
             state.appearance.update(view.index, gradient, self.embedding_rate(step))
-        psnr = psnr_of(result.squared_error) if step.measures_psnr else None
+        psnr = psnr_of(result.squared_error)
         return StepResult(started.number, result.loss, psnr, result.num_visible, result.num_dropped)
 
     def fetch(self) -> None:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.render import Backend, Forward, Gradients, RasterOptions
+from pipeline.render import (
+    Backend,
+    Forward,
+    Gradients,
+    ImageGradients,
+    RasterOptions,
+    ViewGradients,
+)
+from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.step_view import StepView
 from pipeline.training.few_views import ThinnedOpacities, thinned
 from pipeline.training.loop.setup import TrainingScene
@@ -40,30 +48,47 @@ class OperatorStep(StepEngine):
         if opacities is not None:
             drawn = replace(gaussians, opacity_logits=opacities.logits)
         rendered = self.backend.forward(*drawn.parameters(), view.camera, step.options)
-        color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
+        color = self.color_loss.gradients(rendered, view)
         self.require_finite(color.loss, view, state.step)
         others = summed_gradients(self.losses, rendered, view, state.step)
-        gradients = self.backend.backward(
-            rendered,
-            color.d_color,
-            add(color.d_alpha, others.alpha),
-            others.depth,
-            colors=appearance is not None,
-            camera=state.cameras.enabled,
-            sh_adam=state.adam.harmonics(step.adam),
-        )
-        if opacities is not None:
-            gradients.opacity_logits.mul_(opacities.derivative)
+        d_alpha = add(color.d_alpha, others.alpha)
+        of_images = ImageGradients(color.d_color, d_alpha, others.depth)
+        found = self._update(step, drawn, opacities, rendered, of_images)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
-        self._update_cameras(step, gradients)
-        self._observe(rendered, gradients)
-        state.adam.step(gaussians, gradients, step.adam, self.run.threads)
+        self._update_photograph(step, found)
         return [
             StepResult(
                 state.step, color.loss, color.psnr, rendered.num_visible, rendered.num_dropped
             )
         ]
+
+    def _update(
+        self,
+        step: Step,
+        drawn: Gaussians,
+        opacities: ThinnedOpacities | None,
+        rendered: Forward,
+        of_images: ImageGradients,
+    ) -> ViewGradients:
+        """Update the Gaussians and the statistics of density control, at once if nothing else needs
+        the gradients."""
+        state, adam = self.state, self.state.adam.of_all(step.adam)
+        colors, camera = state.appearance is not None, state.cameras.enabled
+        if adam is not None and opacities is None and state.density.statistics is not None:
+            return self.backend.update(
+                rendered, drawn.parameters(), of_images, adam=adam,
+                statistics=state.density.statistics, colors=colors, camera=camera,
+            )  # fmt: skip
+        gradients = self.backend.backward(
+            rendered, *of_images, colors=colors, camera=camera,
+            sh_adam=state.adam.harmonics(step.adam),
+        )  # fmt: skip
+        if opacities is not None:
+            gradients.opacity_logits.mul_(opacities.derivative)
+        self._observe(rendered, gradients)
+        state.adam.step(state.gaussians, gradients, step.adam, self.run.threads)
+        return ViewGradients(gradients.colors, gradients.camera)
 
     def _observe(self, rendered: Forward, gradients: Gradients) -> None:
         """Let density control observe the step."""
@@ -92,9 +117,7 @@ class OperatorStep(StepEngine):
         rendered = self.backend.forward(*gaussians.parameters(), view.camera, options)
         if appearance is not None and shown is not None:
             appearance.hide(gaussians, shown)
-        found = self.color_loss.gradients(rendered, view, measures_psnr=True).psnr
-        assert found is not None
-        return found
+        return self.color_loss.gradients(rendered, view).psnr
 
     def fetch(self) -> None:
         """The tensors of the state are always current."""
@@ -102,7 +125,7 @@ class OperatorStep(StepEngine):
     def invalidate(self) -> None:
         """There are no copies of the tensors of the state."""
 
-    def _update_cameras(self, step: Step, gradients: Gradients) -> None:
+    def _update_photograph(self, step: Step, gradients: ViewGradients) -> None:
         """Update what belongs to the photograph: its camera and its appearance."""
         state, view = self.state, step.view
         if state.appearance is not None:

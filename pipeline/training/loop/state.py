@@ -56,7 +56,6 @@ class CurveWindow:
     loss: float = 0.0
     steps: int = 0
     psnr: float = 0.0
-    samples: int = 0
 
 
 @dataclass
@@ -106,13 +105,11 @@ class TrainState:
             self.counters.changes.add(update.changes)
         return update.changes is not None
 
-    def add_to_window(self, loss: float, psnr: float | None) -> None:
+    def add_to_window(self, loss: float, psnr: float) -> None:
         """Add a step to the sums of the curve's next record."""
         self.window.loss += loss
+        self.window.psnr += psnr
         self.window.steps += 1
-        if psnr is not None:
-            self.window.psnr += psnr
-            self.window.samples += 1
 
     def drop_unseen(self, views: int, sky: Sky | None) -> None:
         """At the end, remove Gaussians without a gradient in a whole epoch of ``views`` views: no
@@ -131,12 +128,11 @@ class TrainState:
     def record(self) -> None:
         """Add a record to the curve and begin a new window."""
         window = self.window
-        previous = self.curve[-1].psnr if self.curve else 0.0
         self.curve.append(
             CurveRecord(
                 step=self.step,
                 loss=window.loss / max(1, window.steps),
-                psnr=window.psnr / window.samples if window.samples else previous,
+                psnr=window.psnr / max(1, window.steps),
                 num_gaussians=len(self.gaussians),
             )
         )

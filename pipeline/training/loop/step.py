@@ -26,8 +26,6 @@ class Step:
     Attributes:
         camera_rate: The learning rate of the parameters of cameras and photographs that a share of
             the steps uses (``Schedule.camera_rate``), as a function of that share.
-        measures_psnr: Whether the PSNR of the render is measured, which takes a pass over the
-            image.
         dropped_share: The share of the Gaussians that is not drawn (``training.few_views``).
     """
 
@@ -35,17 +33,16 @@ class Step:
     options: RasterOptions
     adam: AdamStep
     camera_rate: Callable[[float], float]
-    measures_psnr: bool
     dropped_share: float = 0.0
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """The figures of step ``number``; ``psnr`` in dB, None if it was not measured."""
+    """The figures of step ``number``; ``psnr`` in dB."""
 
     number: int
     loss: float
-    psnr: float | None
+    psnr: float
     num_visible: int
     num_dropped: int
 

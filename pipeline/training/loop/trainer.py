@@ -24,15 +24,12 @@ from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.operator_step import OperatorStep
 from pipeline.training.loop.schedule import Schedule, warm_up
 from pipeline.training.loop.setup import TrainingScene
-from pipeline.training.loop.state import CURVE_RECORDS, TrainState
+from pipeline.training.loop.state import TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.optimisers.adam import AdamStep
 from pipeline.training.run import TrainingRun
 from pipeline.training.transients.evidence import ReducedPhotographs
 from pipeline.training.transients.search import reduction
-
-# PSNR is measured in some of the steps only: it takes a pass over the image.
-PSNR_INTERVAL = 10
 
 
 class Trainer:
@@ -50,7 +47,6 @@ class Trainer:
         self.engine = make_engine(scene, state, run, backend, self.schedule)
         self.floaters = floater_removal(scene, run)
         self.rate_unit = learning_rate_unit(scene.inputs, run.options)
-        self.psnr_interval = min(PSNR_INTERVAL, max(1, run.steps // CURVE_RECORDS))
         self.clock = Clock(run.steps, run.options.budget_minutes, run.span)
 
     def step(self) -> None:
@@ -76,7 +72,6 @@ class Trainer:
                 camera_rate=lambda share: self.schedule.camera_rate(
                     state.clock, max(1.0, run_length * share)
                 ),
-                measures_psnr=(state.step - 1) % self.psnr_interval == 0,
                 dropped_share=self.dropped_share(),
             )
         )

@@ -20,13 +20,13 @@ class ColorGradients:
     Attributes:
         d_color: (H, W, 3) gradient with respect to the rendered colours.
         d_alpha: (H, W) gradient with respect to alpha, for a block among its surroundings.
-        psnr: The PSNR in dB; None if it was not measured.
+        psnr: The PSNR in dB.
     """
 
     loss: float
     d_color: Tensor
     d_alpha: Tensor | None
-    psnr: float | None
+    psnr: float
 
 
 @dataclass(frozen=True)
@@ -44,35 +44,24 @@ class ColorLoss:
     backend: Backend
     threads: int
 
-    def gradients(
-        self, rendered: Forward, view: StepView, *, measures_psnr: bool
-    ) -> ColorGradients:
+    def gradients(self, rendered: Forward, view: StepView) -> ColorGradients:
         """Compare a render with its photograph."""
         target, around = view.target, view.target.surroundings
-        image = target.over(view.background)
-        factor = self.light_factor(view.index, view.factor)
         color = rendered.color
         if around is not None:
             color = self.backend.compose(around, color, rendered.alpha, self.threads)
-        if factor is not None:
-            color = self.backend.scale_colors(color, factor, self.threads)
         loss = self.backend.l1_ssim(
             color,
-            image,
+            target.over(view.background),
             self.ssim_weight,
             target.ignored,
             self.squared_error_weight,
             self.threads,
+            factor=self.light_factor(view.index, view.factor),
         )
-        psnr = None
-        if measures_psnr:
-            error = self.backend.mean_squared_error(color, image, target.ignored, self.threads)
-            psnr = psnr_of(error)
         d_color, d_alpha = loss.grad, None
-        if factor is not None:
-            d_color = self.backend.scale_colors(d_color, factor, self.threads)
         if around is not None:
             d_color, d_alpha = self.backend.compose_backward(
                 around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads
             )
-        return ColorGradients(float(loss.loss), d_color, d_alpha, psnr)
+        return ColorGradients(float(loss.loss), d_color, d_alpha, psnr_of(loss.squared_error))

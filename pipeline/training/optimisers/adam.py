@@ -18,6 +18,7 @@ from pipeline.render import (
     AdamRates,
     Backend,
     FrameMoments,
+    GaussianAdam,
     Gradients,
     Moments,
     ShAdam,
@@ -143,6 +144,19 @@ class Adam:
     def harmonics(self, step: AdamStep) -> ShAdam:
         """The argument of ``Backend.backward`` with which it updates ``sh``."""
         return ShAdam(self.moments("sh"), self.last, self.rates(step)["sh"])
+
+    def of_all(self, step: AdamStep) -> GaussianAdam | None:
+        """The argument of ``Backend.update`` with which it updates all arrays but ``appearance``;
+        None without ``own_frames``."""
+        rates = self.rates(step)
+        if "frames" not in rates:
+            return None
+        return GaussianAdam(
+            FrameMoments(self.moments("means"), self.moments("quats")), rates["frames"],
+            self.moments("log_scales"), rates["log_scales"],
+            self.moments("opacity_logits"), rates["opacity_logits"],
+            self.harmonics(step),
+        )  # fmt: skip
 
     def step(
         self, gaussians: Gaussians, gradients: Gradients, step: AdamStep, threads: int

@@ -18,6 +18,7 @@
 #include "blend.h"
 #include "loss.h"
 #include "project.h"
+#include "update.h"
 
 using namespace splat;
 
@@ -122,23 +123,59 @@ struct Pass {
                     median.get());
         return true;
     }
-    void backward(const float* d_color, const float* d_alpha, const float* d_depth,
-                  bool optional_outputs, const ShAdam* sh_adam) {
-        Array<float> slot_gradients(entries.size * kSlotFloats);
+    Array<float> slot_gradients(const float* d_color, const float* d_alpha, const float* d_depth) {
+        Array<float> found(entries.size * kSlotFloats);
         blend_backward(
             records.get(), {entries.get(), begin.get()}, view,
             {color.get(), alpha.get(), depth.get(), d_color, d_alpha, d_depth, background},
-            block_end.get(), threads, slot_gradients.get());
-        project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
-                              slot_gradients.get(),
-                              {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                               sh_adam ? nullptr : d_sh.get(), d_means2d.get(),
-                               optional_outputs ? d_colors.get() : nullptr,
-                               optional_outputs ? d_camera.get() : nullptr},
-                              sh_adam);
+            block_end.get(), threads, found.get());
+        return found;
     }
-    void loss(const Array<float>& target, const uint8_t* mask) {
-        l1_ssim({view.width, view.height, color.get(), target.data.get(), nullptr, mask},
+    void backward(const float* d_color, const float* d_alpha, const float* d_depth,
+                  bool optional_outputs, const ShAdam* sh_adam) {
+        project_view_backward(
+            in, view, threads, records.get(), radii.get(), slots.get(),
+            slot_gradients(d_color, d_alpha, d_depth).get(),
+            {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), d_means2d.get(),
+             sh_adam ? nullptr : d_sh.get(), optional_outputs ? d_colors.get() : nullptr},
+            optional_outputs ? d_camera.get() : nullptr, sh_adam, nullptr);
+    }
+    void update(Scene& s, bool optional_outputs, const ShAdam& sh_adam) {
+        Array<float> moments[] = {Array<float>(3 * n), Array<float>(3 * n), Array<float>(3 * n),
+                                  Array<float>(3 * n), Array<float>(3 * n), Array<float>(3 * n),
+                                  Array<float>(n),     Array<float>(n)};
+        Array<float> gradient_sum(n), seen(n);
+        const double rates[] = {1e-2, 1e-3};
+        const AdamSettings one = {rates, 1, 0.9, 0.999, 1e-15, 1},
+                           two = {rates, 2, 0.9, 0.999, 1e-15, 1};
+        const auto moment = [&](int k) { return moments[k].get(); };
+        const GaussianUpdate update = {s.means.get(),
+                                       s.quats.get(),
+                                       s.log_scales.get(),
+                                       s.opacity_logits.get(),
+                                       {moment(0), moment(1), moment(2), moment(3)},
+                                       {moment(4), moment(5)},
+                                       {moment(6), moment(7)},
+                                       two,
+                                       one,
+                                       one,
+                                       optional_outputs ? gradient_sum.get() : nullptr,
+                                       optional_outputs ? seen.get() : nullptr,
+                                       radii.get(),
+                                       0.5 * double(view.width),
+                                       0.5 * double(view.height)};
+        project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
+                              slot_gradients(d_loss.get(), nullptr, nullptr).get(),
+                              {nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
+                               optional_outputs ? d_colors.get() : nullptr},
+                              optional_outputs ? d_camera.get() : nullptr, &sh_adam, &update);
+        for (Array<float>& each : moments) expect_finite(each, "moments of an update");
+        expect_finite(gradient_sum, "gradient_sum");
+    }
+    void loss(const Array<float>& target, const uint8_t* mask, const float* factor = nullptr,
+              bool factor_is_image = false) {
+        l1_ssim({view.width, view.height, color.get(), factor, factor_is_image, target.data.get(),
+                 nullptr, mask},
                 {0.2, 2.5}, threads, d_loss.get());
     }
 };
@@ -165,6 +202,8 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     for (size_t i = 0; i < target.size; i++) target[i] = float(i % 97) / 97;
     for (size_t i = 0; i < mask.size; i++) mask[i] = i % 5 == 0;
     p.loss(target, mask.get());
+    p.loss(target, mask.get(), background);
+    p.loss(target, nullptr, target.get(), true);
     p.loss(target, nullptr);
     p.backward(p.d_loss.get(), p.median.get(), p.alpha.get(), true, nullptr);
     p.backward(p.d_loss.get(), nullptr, nullptr, false, nullptr);
@@ -204,6 +243,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
         expect_finite(*values, name);
         if (out) std::fwrite(values->get(), sizeof(float), values->size, out);
     }
+    for (const bool optional_outputs : {true, false}) p.update(s, optional_outputs, sh_adam);
 }
 
 // The file that test_targets.py writes: these, then the Gaussians' fields, the gradients of color,

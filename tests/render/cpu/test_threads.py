@@ -12,9 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.render import RasterOptions, make_backend
+from pipeline.render import ImageGradients, RasterOptions, make_backend
 from pipeline.render.types import AdamRates, AlphaChangeLoss, FrameMoments, Moments, ShAdam
 from tests.render.scenes import camera, random_scene, random_surroundings
+from tests.render.updates import made_adam, moments_of
 
 COUNT = 40_000
 GRADIENTS = (
@@ -46,16 +47,10 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     loss = backend.l1_ssim(fwd.color, target, 0.2, mask, 2.5, threads)
     found |= {"loss": torch.tensor([loss.loss, loss.error, loss.ssim]), "d_color": loss.grad}
 
-    images = ((target, mask), (target, None), (target / 255.0, mask))
-    errors = [backend.mean_squared_error(fwd.color, *of, threads=threads) for of in images]
-    found["errors"] = torch.tensor(errors, dtype=torch.float64)
-    reference = make_backend("reference")
-    expected = [reference.mean_squared_error(fwd.color, *of) for of in images]
-    assert errors == pytest.approx(expected, rel=1e-9)
     for name, shape in (("uniform", (3,)), ("shading", fwd.color.shape)):
         factor = torch.rand(shape, generator=draws)
-        found[name] = backend.scale_colors(fwd.color, factor, threads)
-        assert torch.equal(found[name], fwd.color * factor)
+        lit = backend.l1_ssim(fwd.color, target, 0.2, mask, threads=threads, factor=factor)
+        found |= {name: lit.grad, f"{name} loss": torch.tensor([lit.loss, lit.squared_error])}
 
     around = random_surroundings(301, 403, front=True, correction=True)
     change = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
@@ -73,7 +68,7 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     found["observed"] = observed = torch.rand(2, COUNT, generator=draws)
     statistics = observed.clone()
     backend.observe_gradients(fwd, g, *observed, threads)
-    reference.observe_gradients(fwd, g, *statistics)
+    make_backend("reference").observe_gradients(fwd, g, *statistics)
     assert torch.allclose(observed, statistics, rtol=1e-6)
     sh_adam = ShAdam(sh_moments, last, AdamRates((1e-2, 1e-3), 3))
     backend.backward(fwd, loss.grad, sh_adam=sh_adam)
@@ -90,6 +85,19 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     backend.adam_step(opacity_logits, g.opacity_logits, dense, AdamRates(1e-2, 3), threads)
     backend.adam_step(log_scales, g.log_scales, rows, AdamRates(1e-2, 3), threads)
     found |= {"opacity_logits": opacity_logits, "log_scales": log_scales}
+
+    parameters = means.clone(), log_scales.clone(), quats.clone(), *(t.clone() for t in scene[3:])
+    adam, statistics = made_adam(parameters), torch.zeros(2, COUNT)
+    backend.update(
+        fwd,
+        parameters,
+        ImageGradients(loss.grad),
+        adam=adam,
+        statistics=tuple(statistics),
+        colors=True,
+    )
+    changed = (*parameters, statistics, *moments_of(adam))
+    found |= {f"updated {k}": tensor for k, tensor in enumerate(changed)}
     return found
 
 

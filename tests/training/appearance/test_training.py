@@ -131,13 +131,13 @@ def test_training_without_embeddings_renders_as_before(
 ) -> None:
     """No gradients of colours are computed."""
     asked = []
-    backward = make_backend().backward
+    update = make_backend().update
 
     def watched(*args: object, **options: object) -> object:
         asked.append(options["colors"])
-        return backward(*args, **options)  # type: ignore[arg-type]
+        return update(*args, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(make_backend(), "backward", watched)
+    monkeypatch.setattr(make_backend(), "update", watched)
     run(scene, views, tmp_path, tiny_config(3), embeddings=False)
     assert asked == [False] * 3
 

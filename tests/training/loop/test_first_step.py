@@ -76,17 +76,17 @@ def test_the_gradient_is_that_of_the_loss(
 ) -> None:
     """With exposure gains, vignetting and a slope, against finite differences of the image."""
     seen: dict[str, Any] = {}
-    backward, loss = make_backend().backward, make_backend().l1_ssim
+    update, loss = make_backend().update, make_backend().l1_ssim
 
-    def watched_backward(rendered: Any, d_color: Any, *rest: Any, **options: Any) -> Any:
-        seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
-        return backward(rendered, d_color, *rest, **options)
+    def watched_update(rendered: Any, parameters: Any, of_images: Any, **named: Any) -> Any:
+        seen["color"], seen["d_color"] = rendered.color.clone(), of_images.color.clone()
+        return update(rendered, parameters, of_images, **named)
 
-    def watched_loss(picture: Any, *rest: Any) -> Any:
+    def watched_loss(picture: Any, *rest: Any, factor: Any = None) -> Any:
         seen["wanted_and_weights"] = rest
-        return loss(picture, *rest)
+        return loss(picture, *rest, factor=factor)
 
-    monkeypatch.setattr(make_backend(), "backward", watched_backward)
+    monkeypatch.setattr(make_backend(), "update", watched_update)
     monkeypatch.setattr(make_backend(), "l1_ssim", watched_loss)
     light = [ViewLight(gain=(0.4, 1.0, 2.5), vignetting=(-0.5, -0.3), slope=(0.4, -0.6))]
     train(

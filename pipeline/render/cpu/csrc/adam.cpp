@@ -1,6 +1,5 @@
 #include "adam.h"
 
-#include <cmath>
 #include <vector>
 
 #include "constants.h"
@@ -25,21 +24,10 @@ constexpr float kLog2E = 1.4426950408889634f;
 // Squared norm of a quaternion above which the square of a component may overflow float32.
 constexpr float kNorm2Max = 1e37f;
 
-// Bias corrections of a step: factors of the learning rates and of the root of the second moment.
-struct Corrections {
-    double to_rate;
-    float to_root;
-
-    explicit Corrections(const AdamSettings& s)
-        : to_rate(1 / (1 - std::pow(s.beta1, double(s.step)))),
-          to_root(float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))))) {}
-};
-
 template <int K>
 void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t rows,
                const AdamSettings& s, int threads) {
-    const Corrections correct(s);
-    const float rate = float(s.rates[0] * correct.to_rate), eps = float(s.eps);
+    const float rate = float(s.rates[0] * s.to_rate), eps = float(s.eps);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2);
     const float rest1 = float(1 - s.beta1), rest2 = float((1 - s.beta2) / K);
     parallel_for((rows + kGroup - 1) / kGroup, kGroupsPerRange, threads, [&](int64_t number) {
@@ -51,7 +39,7 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         read_rows(exp_avg + K * first, count, m);
         for (int k = 0; k < K; k++) squares += g[k] * g[k];
         const f32x16 v = load_first(exp_avg_sq + first, count) * beta2 + squares * rest2;
-        const f32x16 far = rate / (sqrt(v) * correct.to_root + eps);
+        const f32x16 far = rate / (sqrt(v) * s.to_root + eps);
         for (int k = 0; k < K; k++) {
             m[k] = m[k] * beta1 + g[k] * rest1;
             p[k] -= far * m[k];
@@ -70,14 +58,12 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
     const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
     // The pattern of rates repeats after as many vectors as it has rates.
     std::vector<float> rates(16 * s.num_rates);
-    const Corrections correct(s);
     for (size_t i = 0; i < rates.size(); i++)
-        rates[i] = float(s.rates[i % s.num_rates] * correct.to_rate);
+        rates[i] = float(s.rates[i % s.num_rates] * s.to_rate);
     const auto update = [&](int64_t k, f32x16& p, f32x16 g, f32x16& m, f32x16& v) {
         m = m * beta1 + g * rest1;
         v = v * beta2 + g * g * rest2;
-        p -= load<f32x16>(rates.data() + 16 * (k % s.num_rates)) * m /
-             (sqrt(v) * correct.to_root + eps);
+        p -= load<f32x16>(rates.data() + 16 * (k % s.num_rates)) * m / (sqrt(v) * s.to_root + eps);
     };
     const int64_t vectors = count / 16;
     parallel_for(vectors, kVectorsPerRange, threads, [&](int64_t k) {
@@ -108,9 +94,8 @@ void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_
 void frame_adam(float* means, float* quats, const float* log_scales, const float* d_means,
                 const float* d_quats, const FrameMoments& moments, int64_t rows,
                 const AdamSettings& s, int threads) {
-    const Corrections correct(s);
-    const float mean_rate = float(s.rates[0] * correct.to_rate);
-    const float rotation_rate = float(s.rates[1] * correct.to_rate);
+    const float mean_rate = float(s.rates[0] * s.to_rate);
+    const float rotation_rate = float(s.rates[1] * s.to_rate);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2), eps = float(s.eps);
     const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
     // Replaces gradients by Adam's normalised steps; moments are rows of 3.
@@ -122,7 +107,7 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
             g[k] = min(max(g[k], splat16(-kGradientMax)), splat16(kGradientMax));
             m[k] = m[k] * beta1 + g[k] * rest1;
             v[k] = v[k] * beta2 + g[k] * g[k] * rest2;
-            g[k] = m[k] / (sqrt(v[k]) * correct.to_root + eps);
+            g[k] = m[k] / (sqrt(v[k]) * s.to_root + eps);
         }
         write_rows(m, count, exp_avg);
         write_rows(v, count, exp_avg_sq);

@@ -1,6 +1,7 @@
 // Adam (Kingma & Ba 2015), dense and in place.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 
 namespace splat {
@@ -10,6 +11,9 @@ struct AdamSettings {
     int64_t num_rates;    // at least 1
     double beta1, beta2, eps;
     int64_t step;  // from 1
+    // Bias corrections: factors of the learning rates and of the root of the second moment.
+    double to_rate = 1 / (1 - std::pow(beta1, double(step)));
+    float to_root = float(1 / std::sqrt(1 - std::pow(beta2, double(step))));
 };
 
 void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t count,

@@ -17,6 +17,8 @@
 #include "project.h"
 #include "step.h"
 #include "surroundings.h"
+#include "threads.h"
+#include "update.h"
 
 namespace {
 
@@ -155,9 +157,29 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
     return slots;
 }
 
+splat::ShAdam sh_adam_from(const Tensor& sh, const Tensor& exp_avg, const Tensor& exp_avg_sq,
+                           const Tensor& last, const Tensor& adam) {
+    const splat::AdamSettings s = settings_from(adam);
+    return {{mutable_floats(sh), static_cast<uint16_t*>(exp_avg.mutable_data_ptr()),
+             mutable_floats(exp_avg_sq), last.mutable_data_ptr<int32_t>()},
+            {s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step}};
+}
+
+const splat::Slots* slots_from(const Tensor& t) {
+    return reinterpret_cast<const splat::Slots*>(t.const_data_ptr<int32_t>());
+}
+
+// The gradients of the camera's parameters, float64; no rows if not requested.
+Tensor new_camera_gradients(bool requested) {
+    return new_tensor<double>({requested ? splat::kCameraParameters : 0}, ScalarType::Double);
+}
+double* doubles_or_null(const Tensor& t) {
+    return t.numel() ? t.mutable_data_ptr<double>() : nullptr;
+}
+
 // Gradients of means, log_scales, quats, opacity_logits, sh, means2d, colours and the camera's
-// parameters (float64); the last two have no rows if not requested. With exp_avg, exp_avg_sq, last
-// and adam, sh is updated in place and its gradient has no rows.
+// parameters; the last two have no rows if not requested. With exp_avg, exp_avg_sq, last and adam,
+// sh is updated in place and its gradient has no rows.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, const Tensor& records,
@@ -166,58 +188,79 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     OptionalTensor adam, int64_t threads) {
     const int64_t n = means.size(0);
     std::optional<splat::ShAdam> sh_adam;
-    if (adam) {
-        const splat::AdamSettings s = settings_from(*adam);
-        sh_adam.emplace(
-            splat::ShAdamState{mutable_floats(sh),
-                               static_cast<uint16_t*>(exp_avg->mutable_data_ptr()),
-                               mutable_floats(*exp_avg_sq), last->mutable_data_ptr<int32_t>()},
-            splat::ShAdamSettings{s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step});
-    }
+    if (adam) sh_adam.emplace(sh_adam_from(sh, *exp_avg, *exp_avg_sq, *last, *adam));
     Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
            d_quats = new_floats({n, 4});
     Tensor d_opacity = new_floats({n}), d_sh = new_floats({adam ? 0 : n, sh.size(1), 3});
     Tensor d_means2d = new_floats({n, 2}), d_colors = new_floats({colors ? n : 0, 3});
-    Tensor d_camera =
-        new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
+    Tensor d_camera = new_camera_gradients(camera);
     splat::project_view_backward(
         gaussians_from(means, log_scales, quats, opacity_logits, sh), view_from(view), int(threads),
-        records_from(records), floats(radii),
-        reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
-        floats(slot_gradients),
+        records_from(records), floats(radii), slots_from(slots), floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
-         mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
-         mutable_floats(d_means2d), colors ? mutable_floats(d_colors) : nullptr,
-         camera ? d_camera.mutable_data_ptr<double>() : nullptr},
-        adam ? &*sh_adam : nullptr);
+         mutable_floats(d_opacity), mutable_floats(d_means2d),
+         adam ? nullptr : mutable_floats(d_sh), colors ? mutable_floats(d_colors) : nullptr},
+        doubles_or_null(d_camera), adam ? &*sh_adam : nullptr, nullptr);
     return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera};
 }
 
-splat::LossImages images_from(const Tensor& rendered, const Tensor& target,
-                              const OptionalTensor& mask) {
-    const bool bytes = target.scalar_type() == ScalarType::Byte;
-    return {rendered.size(1),
-            rendered.size(0),
-            floats(rendered),
-            bytes ? nullptr : floats(target),
-            bytes ? target.const_data_ptr<uint8_t>() : nullptr,
-            mask ? mask->const_data_ptr<uint8_t>() : nullptr};
+// Updates all parameters and, if given, the statistics; returns the gradients of colours and of the
+// camera's parameters. moments: the first and the second of means, rotations, log_scales,
+// opacity_logits and sh. adams: of means and rotations, log_scales, opacity_logits and sh.
+std::tuple<Tensor, Tensor> project_backward_update(
+    const Tensor& means, const Tensor& log_scales, const Tensor& quats,
+    const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, const Tensor& records,
+    const Tensor& radii, const Tensor& slots, const Tensor& slot_gradients,
+    std::vector<Tensor> moments, const Tensor& last, std::vector<Tensor> adams,
+    OptionalTensor gradient_sum, OptionalTensor seen, bool colors, bool camera, int64_t threads) {
+    const splat::View from = view_from(view);
+    const splat::ShAdam sh_adam = sh_adam_from(sh, moments[8], moments[9], last, adams[3]);
+    const auto moment = [&](int i) { return mutable_floats(moments[i]); };
+    const splat::GaussianUpdate update = {mutable_floats(means),
+                                          mutable_floats(quats),
+                                          mutable_floats(log_scales),
+                                          mutable_floats(opacity_logits),
+                                          {moment(0), moment(1), moment(2), moment(3)},
+                                          {moment(4), moment(5)},
+                                          {moment(6), moment(7)},
+                                          settings_from(adams[0]),
+                                          settings_from(adams[1]),
+                                          settings_from(adams[2]),
+                                          gradient_sum ? mutable_floats(*gradient_sum) : nullptr,
+                                          seen ? mutable_floats(*seen) : nullptr,
+                                          floats(radii),
+                                          0.5 * double(from.width),
+                                          0.5 * double(from.height)};
+    Tensor d_colors = new_floats({colors ? means.size(0) : 0, 3});
+    Tensor d_camera = new_camera_gradients(camera);
+    splat::project_view_backward(gaussians_from(means, log_scales, quats, opacity_logits, sh), from,
+                                 int(threads), records_from(records), floats(radii),
+                                 slots_from(slots), floats(slot_gradients),
+                                 {nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
+                                  colors ? mutable_floats(d_colors) : nullptr},
+                                 doubles_or_null(d_camera), &sh_adam, &update);
+    return {d_colors, d_camera};
 }
 
-// loss, error, ssim, (H, W, 3) gradient
-std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
-                                                   OptionalTensor mask, double ssim_weight,
-                                                   double l2_weight, int64_t threads) {
+// loss, error, ssim, squared error, (H, W, 3) gradient
+std::tuple<double, double, double, double, Tensor> l1_ssim(const Tensor& rendered,
+                                                           OptionalTensor factor,
+                                                           const Tensor& target,
+                                                           OptionalTensor mask, double ssim_weight,
+                                                           double l2_weight, int64_t threads) {
+    const bool bytes = target.scalar_type() == ScalarType::Byte;
+    const splat::LossImages images = {rendered.size(1),
+                                      rendered.size(0),
+                                      floats(rendered),
+                                      floats(factor),
+                                      factor && factor->dim() == 3,
+                                      bytes ? nullptr : floats(target),
+                                      bytes ? target.const_data_ptr<uint8_t>() : nullptr,
+                                      mask ? mask->const_data_ptr<uint8_t>() : nullptr};
     Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
     const splat::LossValues values =
-        splat::l1_ssim(images_from(rendered, target, mask), {ssim_weight, l2_weight}, int(threads),
-                       mutable_floats(grad));
-    return {values.loss, values.error, values.ssim, grad};
-}
-
-double mean_squared_error(const Tensor& rendered, const Tensor& target, OptionalTensor mask,
-                          int64_t threads) {
-    return splat::mean_squared_error(images_from(rendered, target, mask), int(threads));
+        splat::l1_ssim(images, {ssim_weight, l2_weight}, int(threads), mutable_floats(grad));
+    return {values.loss, values.error, values.ssim, values.squared_error, grad};
 }
 
 splat::Surroundings surroundings_from(const Tensor& behind, const Tensor& alpha,
@@ -264,13 +307,6 @@ void observe_gradients(const Tensor& means2d, const Tensor& radii, const Tensor&
 }
 
 // (H, W, 3) image
-Tensor scale_colors(const Tensor& image, const Tensor& factor, int64_t threads) {
-    Tensor scaled = new_floats({image.size(0), image.size(1), 3});
-    splat::scale_colors(floats(image), floats(factor), factor.numel(), image.numel(), int(threads),
-                        mutable_floats(scaled));
-    return scaled;
-}
-
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                const Tensor& exp_avg_sq, const Tensor& adam, int64_t threads) {
     const splat::AdamSettings settings = settings_from(adam);
@@ -292,6 +328,11 @@ void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scal
                       {mutable_floats(mean_avg), mutable_floats(mean_avg_sq),
                        mutable_floats(rotation_avg), mutable_floats(rotation_avg_sq)},
                       means.size(0), settings_from(adam), int(threads));
+}
+
+std::tuple<double, double> loop_time() {
+    const splat::LoopTime time = splat::loop_time();
+    return {time.loops, time.threads};
 }
 
 }  // namespace
@@ -320,9 +361,14 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? adam, int threads) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
-        "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, "
-        "float l2_weight, int threads) -> (float, float, float, Tensor)");
-    m.def("mean_squared_error(Tensor rendered, Tensor target, Tensor? mask, int threads) -> float");
+        "project_backward_update(Tensor(a!) means, Tensor(b!) log_scales, Tensor(c!) quats, "
+        "Tensor(d!) opacity_logits, Tensor(e!) sh, Tensor view, Tensor records, Tensor radii, "
+        "Tensor slots, Tensor slot_gradients, Tensor(f!)[] moments, Tensor(g!) last, "
+        "Tensor[] adams, Tensor(h!)? gradient_sum, Tensor(i!)? seen, bool colors, bool camera, "
+        "int threads) -> (Tensor, Tensor)");
+    m.def(
+        "l1_ssim(Tensor rendered, Tensor? factor, Tensor target, Tensor? mask, float ssim_weight, "
+        "float l2_weight, int threads) -> (float, float, float, float, Tensor)");
     m.def(
         "compose(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
         "Tensor? correction, Tensor color, Tensor alpha, int threads) -> Tensor");
@@ -333,7 +379,6 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "observe_gradients(Tensor means2d, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) seen, "
         "float scale_x, float scale_y, int threads) -> ()");
-    m.def("scale_colors(Tensor image, Tensor factor, int threads) -> Tensor");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor adam, int threads) -> ()");
@@ -343,6 +388,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor(f!) rotation_avg_sq, Tensor adam, int threads) -> ()");
     m.def("release_memory() -> ()");
     m.def("save_memory(bool little) -> ()");
+    m.def("loop_time() -> (float, float)");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
@@ -352,12 +398,11 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("blend_depth", TORCH_BOX(&blend_depth));
     m.impl("blend_backward", TORCH_BOX(&blend_backward));
     m.impl("project_backward", TORCH_BOX(&project_backward));
+    m.impl("project_backward_update", TORCH_BOX(&project_backward_update));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
-    m.impl("mean_squared_error", TORCH_BOX(&mean_squared_error));
     m.impl("compose", TORCH_BOX(&compose));
     m.impl("compose_backward", TORCH_BOX(&compose_backward));
     m.impl("observe_gradients", TORCH_BOX(&observe_gradients));
-    m.impl("scale_colors", TORCH_BOX(&scale_colors));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }
@@ -366,4 +411,5 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CompositeExplicitAutograd, m) {
     m.impl("release_memory", TORCH_BOX(&splat::release_unused_memory));
     m.impl("save_memory", TORCH_BOX(&splat::save_memory));
+    m.impl("loop_time", TORCH_BOX(&loop_time));
 }

@@ -92,6 +92,17 @@ struct Ring {
     float* row(int64_t y) const { return memory + (y + 2 * kRows) % kRows * stride; }
 };
 
+// Sums of a row's |x - y|, SSIM and (x - y)^2.
+struct Sums {
+    double error, ssim, squared;
+
+    void operator+=(const Sums& more) {
+        error += more.error;
+        ssim += more.ssim;
+        squared += more.squared;
+    }
+};
+
 // Columns [begin, end) of an image's rows of `values` floats. The buffers have 2 kReach more floats
 // on each side, for the blur of a blur.
 class Strip {
@@ -112,21 +123,26 @@ class Strip {
           origin_(begin - 2 * kReach),
           from_(std::max(origin_, int64_t(0))),
           to_(std::min(origin_ + stride_, values_)),
-          memory_(size_t((6 * kRows + 9) * stride_)) {
+          memory_(size_t((7 * kRows + 10) * stride_)) {
         float* next = memory_.get();
-        for (Ring* ring : {&x_, &y_, &keep_, &d_m_, &d_2_, &d_xy_}) {
+        for (Ring* ring : {&x_, &y_, &keep_, &factors_, &d_m_, &d_2_, &d_xy_}) {
             *ring = {next, stride_};
             next += kRows * stride_;
         }
         for (auto& lines : line_)
             for (float*& line : lines) line = next, next += stride_;
         inside_ = next;
-        for (int64_t i = 0; i < stride_; i++)
-            inside_[i] = origin_ + i >= from_ && origin_ + i < to_ ? 1.0f : 0.0f;
+        factor_ = next + stride_;
+        for (int64_t i = 0; i < stride_; i++) {
+            const int64_t column = origin_ + i;
+            const bool inside = column >= from_ && column < to_;
+            inside_[i] = inside ? 1.0f : 0.0f;
+            factor_[i] = inside && in.factor && !in.factor_is_image ? in.factor[column % 3] : 1.0f;
+        }
     }
 
     // Rows [first, last) of the gradient, and their sums.
-    void walk(int64_t first, int64_t last, float* grad, double* row_error, double* row_ssim) {
+    void walk(int64_t first, int64_t last, float* grad, Sums* rows) {
         for (int64_t y = first - 2 * kRadius; y < last + 2 * kRadius; y += 2) {
             read(y);
             read(y + 1);
@@ -135,8 +151,7 @@ class Strip {
                 blur_images_down(middle);
                 for (int64_t row = middle; row < middle + 2; row++) {
                     const Sums sums = differentiate(row, line_[row - middle]);
-                    if (row >= first && row < last)
-                        row_error[row] = sums.error, row_ssim[row] = sums.ssim;
+                    if (row >= first && row < last) rows[row] = sums;
                 }
             }
             if (done >= first) {
@@ -148,10 +163,6 @@ class Strip {
     }
 
   private:
-    struct Sums {
-        double error, ssim;
-    };
-
     // Row y of the images: zeros outside, and equal values in both where the mask is set.
     void read(int64_t y) {
         float *x = x_.row(y), *target = y_.row(y);
@@ -164,7 +175,10 @@ class Strip {
         }
         if (outside) return;
         const int64_t offset = y * values_ + from_, size = to_ - from_;
-        std::memcpy(x + first, in_.rendered + offset, size * sizeof(float));
+        const float* const factor = factors(y) + first;
+        if (in_.factor_is_image)
+            std::memcpy(factors_.row(y) + first, in_.factor + offset, size * sizeof(float));
+        for (int64_t i = 0; i < size; i++) x[first + i] = in_.rendered[offset + i] * factor[i];
         if (in_.target_float)
             std::memcpy(target + first, in_.target_float + offset, size * sizeof(float));
         else
@@ -176,6 +190,11 @@ class Strip {
         for (int64_t i = from_; i < to_; i++)
             if (in_.mask[y * in_.width + i / 3])
                 x[i - origin_] = target[i - origin_], keep[i - origin_] = 0;
+    }
+
+    // The factors of the rendered row y, undefined outside the image.
+    const float* factors(int64_t y) const {
+        return in_.factor_is_image ? factors_.row(y) : factor_;
     }
 
     // 1 for valid values, 0 outside the image and for masked values.
@@ -211,18 +230,18 @@ class Strip {
         }
     }
 
-    // Row y of the three derivatives, from the output of blur_images_down; adds to the sums of
-    // |x - y| and SSIM.
+    // Row y of the three derivatives, from the output of blur_images_down; returns the sums.
     Sums differentiate(int64_t y, float* const* line) {
         if (y < 0 || y >= in_.height) {
             for (const Ring& ring : {d_m_, d_2_, d_xy_})
                 std::memset(ring.row(y), 0, stride_ * sizeof(float));
-            return {0, 0};
+            return {};
         }
         const float *x = x_.row(y), *target = y_.row(y);
         float *to_m = d_m_.row(y), *to_2 = d_2_.row(y), *to_xy = d_xy_.row(y);
         const float* keep = weights(y);
-        Lanes error[16 / kLanes] = {}, ssim[16 / kLanes] = {};  // 16 sums each, on every target
+        // 16 sums each, on every target
+        Lanes error[16 / kLanes] = {}, ssim[16 / kLanes] = {}, squared[16 / kLanes] = {};
         for (int64_t i = kReach; i < stride_ - kReach; i += kLanes) {
             const Lanes m_x = blur_across(line[0] + i, window_);
             const Lanes m_y = blur_across(line[1] + i, window_);
@@ -240,8 +259,9 @@ class Strip {
             if (i >= 2 * kReach && i < 2 * kReach + own_) {
                 const Lanes d = load<Lanes>(x + i) - load<Lanes>(target + i);
                 const int64_t part = i / kLanes % (16 / kLanes);
-                error[part] += weight * (abs(d) + square_ * d * d);
+                error[part] += weight * abs(d);
                 ssim[part] += weight * value;
+                squared[part] += weight * d * d;
             }
             const Lanes d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
             store(to_m + i, weight * 2.0f * d_m);
@@ -249,10 +269,11 @@ class Strip {
             store(to_xy + i, weight * 2.0f * a1 * inverse);
         }
         Sums sums = {};
-        float errors[16], ssims[16];
+        float errors[16], ssims[16], squares[16];
         std::memcpy(errors, error, sizeof(errors));
         std::memcpy(ssims, ssim, sizeof(ssims));
-        for (int lane = 0; lane < 16; lane++) sums.error += errors[lane], sums.ssim += ssims[lane];
+        std::memcpy(squares, squared, sizeof(squares));
+        for (int lane = 0; lane < 16; lane++) sums += {errors[lane], ssims[lane], squares[lane]};
         return sums;
     }
 
@@ -281,7 +302,7 @@ class Strip {
                                b * blur_across(line[2] + i, window_);
             const Lanes one = broadcast<Lanes>(1.0f);
             const Lanes sign = keep(a > b, one) - keep(b > a, one);
-            const Lanes out = load<Lanes>(weights(y) + i) *
+            const Lanes out = load<Lanes>(weights(y) + i) * load<Lanes>(factors(y) + i) *
                               (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
             float* const to = grad + y * values_ + column;
@@ -299,8 +320,8 @@ class Strip {
     const int64_t own_, stride_;        // floats of the strip in whole vectors; of a buffer's row
     const int64_t origin_, from_, to_;  // columns: a buffer's first, those that the image has
     const Scratch<float> memory_;
-    Ring x_, y_, keep_, d_m_, d_2_, d_xy_;
-    float *line_[2][4], *inside_;
+    Ring x_, y_, keep_, factors_, d_m_, d_2_, d_xy_;
+    float *line_[2][4], *inside_, *factor_;
 };
 
 // Number of bands of each strip, such that threads which take one after another end earliest.
@@ -334,27 +355,26 @@ LossValues l1_ssim(const LossImages& in, const LossWeights& weights, int threads
     const int64_t values = 3 * in.width, height = in.height, count = count_values(in, threads);
     if (count == 0) {
         std::memset(grad, 0, height * values * sizeof(float));
-        return {0, 0, 1};
+        return {0, 0, 1, 0};
     }
     // Strips depend on the image only, and rows are computed identically in any band: sums do not
     // depend on the number of threads.
     const int64_t strips = (values + kStripFloats - 1) / kStripFloats;
     const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
     const int64_t bands = bands_of(strips, height, threads);
-    std::vector<double> row_error(strips * height), row_ssim(strips * height);
+    std::vector<Sums> rows(strips * height);
     parallel_for(strips * bands, 1, threads, [&](int64_t unit) {
         const int64_t number = unit / bands, band = unit % bands, begin = number * across;
         if (begin >= values) return;
         Strip strip(in, window, weights, count, begin, std::min(begin + across, values));
         strip.walk(height * band / bands, height * (band + 1) / bands, grad,
-                   row_error.data() + number * height, row_ssim.data() + number * height);
+                   rows.data() + number * height);
     });
-    double error = 0, ssim = 0;
-    for (double sum : row_error) error += sum;
-    for (double sum : row_ssim) ssim += sum;
-    error /= double(count);
-    ssim /= double(count);
-    return {(1 - weights.ssim) * error + weights.ssim * (1 - ssim), error, ssim};
+    Sums all = {};
+    for (const Sums& row : rows) all += row;
+    const double ssim = all.ssim / double(count), squared = all.squared / double(count);
+    const double error = all.error / double(count) + weights.square * squared;
+    return {(1 - weights.ssim) * error + weights.ssim * (1 - ssim), error, ssim, squared};
 }
 
 }  // namespace splat

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 
@@ -5,6 +6,7 @@
 #include "memory.h"
 #include "project.h"
 #include "threads.h"
+#include "update.h"
 
 namespace splat {
 namespace {
@@ -102,10 +104,10 @@ struct GroupGradients {
     }
 };
 
-// Writes zero gradients of `count` Gaussians from `first` on.
-void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t sh_width) {
+// Writes zero gradients of `count` Gaussians.
+void write_zeros(const GaussianGradients& out, int count, int64_t sh_width) {
     const auto clear = [&](float* to, int64_t width) {
-        if (to) std::memset(to + width * first, 0, size_t(width) * count * sizeof(float));
+        if (to) std::memset(to, 0, size_t(width) * count * sizeof(float));
     };
     clear(out.means, 3);
     clear(out.log_scales, 3);
@@ -137,38 +139,48 @@ void add_camera(const Group& group, const View& view, const ImageGradients (&ima
     }
 }
 
+// Groups whose gradients are in the cache at once.
+constexpr int64_t kBlock = 8, kBlocksPerRange = 4;
+
+// The gradients of a block, if an update consumes them.
+struct BlockGradients {
+    alignas(64) float means[kBlock * kGroup * 3], log_scales[kBlock * kGroup * 3],
+        quats[kBlock * kGroup * 4], opacity_logits[kBlock * kGroup], means2d[kBlock * kGroup * 2];
+};
+
 }  // namespace
 
 void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const Record* records, const float* radii, const Slots* slots,
-                           const float* slot_gradients, const GaussianGradients& out,
-                           const ShAdam* sh_adam) {
+                           const float* slot_gradients, const GaussianGradients& all,
+                           double* camera, const ShAdam* sh_adam, const GaussianUpdate* update) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
     // Sums of each group, all of one parameter after another, added in order: the result does not
     // depend on the number of threads.
-    const Scratch<double> camera(out.camera ? kCameraParameters * count : 0);
-    parallel_for(count, 32, threads, [&](int64_t number) {
+    const Scratch<double> of_groups(camera ? kCameraParameters * count : 0);
+    const auto backward = [&](int64_t number, const GaussianGradients& out) {
         const Group group(in, number);
         const int64_t first = group.first;
         double of_camera[kCameraParameters] = {};
         const auto write_camera = [&] {
-            if (!out.camera) return;
-            for (int k = 0; k < kCameraParameters; k++) camera[count * k + number] = of_camera[k];
+            if (!camera) return;
+            for (int k = 0; k < kCameraParameters; k++)
+                of_groups[count * k + number] = of_camera[k];
         };
         uint32_t drawn = 0;
         for (int lane = 0; lane < group.count; lane++)
             drawn |= uint32_t(radii[first + lane] > 0 && slots[first + lane].count > 0) << lane;
 
         if (!drawn) {
-            write_zeros(out, first, group.count, sh_width);
+            write_zeros(out, group.count, sh_width);
             write_camera();
             return;
         }
         const GroupMoments moments(records + first, slots + first, slot_gradients, drawn);
         drawn &= moments.any();
         if (!drawn) {
-            write_zeros(out, first, group.count, sh_width);
+            write_zeros(out, group.count, sh_width);
             write_camera();
             return;
         }
@@ -206,23 +218,39 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (f32x16& v : d_rgb) clear(v);
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
-        if (out.camera) add_camera(group, view, image, gradients, d_mean, bits(sound), of_camera);
+        if (camera) add_camera(group, view, image, gradients, d_mean, bits(sound), of_camera);
         write_camera();
-        write_rows(g.mean, group.count, out.means + 3 * first);
-        write_rows(g.log_scale, group.count, out.log_scales + 3 * first);
-        write_rows(g.quat, group.count, out.quats + 4 * first);
-        store_first(out.opacity_logits + first, g.opacity_logit, group.count);
-        write_rows(g.means2d, group.count, out.means2d + 2 * first);
-        if (out.colors) write_rows(d_rgb, group.count, out.colors + 3 * first);
+        write_rows(g.mean, group.count, out.means);
+        write_rows(g.log_scale, group.count, out.log_scales);
+        write_rows(g.quat, group.count, out.quats);
+        store_first(out.opacity_logits, g.opacity_logit, group.count);
+        write_rows(g.means2d, group.count, out.means2d);
+        if (out.colors) write_rows(d_rgb, group.count, out.colors);
         if (sh_adam)
             sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
         else if (out.sh)
-            sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
+            sh.write(view.sh_degree, out.sh, sh_width, group.count);
+    };
+    parallel_for((count + kBlock - 1) / kBlock, kBlocksPerRange, threads, [&](int64_t block) {
+        const int64_t begin = kBlock * block, end = std::min(begin + kBlock, count);
+        const int64_t first = kGroup * begin;
+        GaussianGradients out = all.from(first, sh_width);
+        BlockGradients of_block;
+        if (update) {
+            out.means = of_block.means;
+            out.log_scales = of_block.log_scales;
+            out.quats = of_block.quats;
+            out.opacity_logits = of_block.opacity_logits;
+            out.means2d = of_block.means2d;
+        }
+        for (int64_t number = begin; number < end; number++)
+            backward(number, out.from(kGroup * (number - begin), sh_width));
+        if (update) (*update)(first, std::min(kGroup * kBlock, in.count - first), out);
     });
-    parallel_for(out.camera ? kCameraParameters : 0, 1, threads, [&](int64_t k) {
+    parallel_for(camera ? kCameraParameters : 0, 1, threads, [&](int64_t k) {
         double sum = 0;
-        for (int64_t number = 0; number < count; number++) sum += camera[count * k + number];
-        out.camera[k] = sum;
+        for (int64_t number = 0; number < count; number++) sum += of_groups[count * k + number];
+        camera[k] = sum;
     });
 }
 

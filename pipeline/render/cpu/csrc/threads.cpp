@@ -24,6 +24,8 @@ constexpr int64_t kFiner = 4, kLast = 2;
 // training runs share two processors fairly.
 constexpr int kLooks = 16;
 
+using Clock = std::chrono::steady_clock;
+
 inline void pause() {
 #if defined(__x86_64__)
     __builtin_ia32_pause();
@@ -31,6 +33,20 @@ inline void pause() {
     asm volatile("yield");
 #endif
 }
+
+// A sum of durations, of several threads.
+class Sum {
+  public:
+    void operator+=(Clock::duration more) {
+        ticks_.fetch_add(more.count(), std::memory_order_relaxed);
+    }
+    double seconds() const {
+        return std::chrono::duration<double>(Clock::duration(ticks_)).count();
+    }
+
+  private:
+    std::atomic<Clock::rep> ticks_{0};
+};
 
 // Worker threads join the open loop if they are in time; the caller does not wait for those that
 // are not, so a thread that wakes slowly does not delay the loop.
@@ -46,6 +62,7 @@ class Crew {
             if (count > 0) body(context, 0, count);
             return;
         }
+        const auto start = Clock::now();
         hire(helpers);
         body_ = body, context_ = context, count_ = count, grain_ = grain;
         whole_ = std::max<int64_t>(0, ranges - kLast * (helpers + 1));
@@ -61,8 +78,11 @@ class Crew {
         state_.fetch_and(~kOpen);
         for (int looks = 0; state_.load(std::memory_order_acquire) % kPlace; looks++)
             look_again(looks);
+        loops_ += Clock::now() - start;
         busy_.store(false, std::memory_order_release);
     }
+
+    LoopTime time() const { return {loops_.seconds(), inside_.seconds()}; }
 
   private:
     // state_: | generation | places left: 8 bits | open: 1 bit | threads inside: 15 bits |
@@ -84,7 +104,13 @@ class Crew {
         }
     }
 
+    // Runs ranges until none is left.
     void work() {
+        const auto start = Clock::now();
+        take_ranges();
+        inside_ += Clock::now() - start;
+    }
+    void take_ranges() {
         const int64_t fine = std::max<int64_t>(1, grain_ / kFiner);
         for (;;) {
             const int64_t number = next_.fetch_add(1, std::memory_order_relaxed);
@@ -143,6 +169,7 @@ class Crew {
     std::mutex mutex_;
     std::condition_variable wake_;
     int hired_ = 0;
+    Sum loops_, inside_;
 
     // Of the open loop
     RangeBody body_;
@@ -170,5 +197,7 @@ Crew& crew() {
 void run_ranges(int64_t count, int64_t grain, int threads, RangeBody body, const void* context) {
     crew().run(count, grain, threads, body, context);
 }
+
+LoopTime loop_time() { return crew().time(); }
 
 }  // namespace splat

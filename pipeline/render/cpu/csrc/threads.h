@@ -10,6 +10,13 @@ namespace splat {
 using RangeBody = void (*)(const void* context, int64_t begin, int64_t end);
 void run_ranges(int64_t count, int64_t grain, int threads, RangeBody body, const void* context);
 
+// Seconds since the start of the process: of all loops on several threads, and of all threads that
+// run ranges in them.
+struct LoopTime {
+    double loops, threads;
+};
+LoopTime loop_time();
+
 // Calls body(begin, end) for [0, count) in ranges of about `grain`, on at most `threads` threads
 // including the caller. The ranges and which thread runs which one are not determined: the last
 // ones are smaller, and all are one if another loop occupies the threads.

@@ -108,7 +108,7 @@ def measure(scene: Scene, backend: GpuBackend, turns: int) -> GpuResult:
 def _sh_bytes(scene: Scene) -> float:
     """The bytes of the SH coefficients and their moments that a step reads and writes at least, if
     all Gaussians are in view."""
-    return 6.0 * 4 * scene.gaussians[4].numel()
+    return 2 * (4 + 2 + 4 / 3) * scene.gaussians[4].numel()
 
 
 def report(result: GpuResult) -> None:

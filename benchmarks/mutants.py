@@ -143,9 +143,16 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "no_drift": Mutant(
         f"{_CSRC}/sh_adam.h",
-        "if (missed) p -= rate * past.drift * m * inverse_root(v);",
+        "if (missed) p -= rate * m * load<f32x16>(before + 16 * j);",
         "",
         "what Adam would have done out of view never made good",
+        _LOSS,
+    ),
+    "moments_truncated": Mutant(
+        f"{_CSRC}/bfloat16.h",
+        "(bits + 0x7fffu + (bits >> 16 & 1u)) >> 16",
+        "bits >> 16",
+        "first moments of SH are rounded towards zero",
         _LOSS,
     ),
     "short_reach": Mutant(

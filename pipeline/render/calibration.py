@@ -96,6 +96,7 @@ def _optimised(scene: StepScene) -> Optimised:
     first = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
     first["quats"] = torch.zeros(count, 3)
     second = {name: torch.zeros_like(tensor) for name, tensor in first.items()}
+    first["sh"], second["sh"] = first["sh"].bfloat16(), second["sh"][..., :1].contiguous()
     last = torch.zeros(count, dtype=torch.int32)
     return Optimised(parameters, first, second, last, torch.zeros(count), torch.zeros(count))
 

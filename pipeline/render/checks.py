@@ -143,9 +143,16 @@ def layers(around: Surroundings, color: Tensor, alpha: Tensor) -> tuple[Tensor, 
 
 def check_sh_adam(adam: ShAdam, sh: Tensor) -> None:
     """Raise ValueError if the moments do not fit ``sh`` or the rates are invalid."""
-    for tensor in (adam.moments.exp_avg, adam.moments.exp_avg_sq):
-        if tensor.dtype != torch.float32 or tensor.shape != sh.shape or not tensor.is_contiguous():
-            raise ValueError("sh_adam: moments must be float32, contiguous and shaped as sh")
+    count, bands, _ = sh.shape
+    for tensor, dtype, shape in (
+        (adam.moments.exp_avg, torch.bfloat16, (count, bands, 3)),
+        (adam.moments.exp_avg_sq, torch.float32, (count, bands, 1)),
+    ):
+        if tensor.dtype != dtype or tensor.shape != shape or not tensor.is_contiguous():
+            raise ValueError(
+                f"sh_adam: moments: expected contiguous {dtype} {shape}, found {tensor.dtype} "
+                f"{tuple(tensor.shape)}"
+            )
     if adam.last.dtype != torch.int32 or adam.last.shape != sh.shape[:1]:
         raise ValueError(f"sh_adam: last must be int32 of shape ({len(sh)},)")
     _check_rates("sh_adam", adam.rates, count=2)

@@ -69,7 +69,8 @@ def frame_adam(
 
 def sh_adam(sh: Tensor, grad: Tensor, updated: Tensor, adam: ShAdam) -> None:
     """Adam over the SH coefficients (N, K, 3) of the Gaussians with a gradient, ``updated`` (N,)
-    bool; in place. All tensors but ``adam.last`` have the type of ``sh``.
+    bool; in place. First moments may have a type of their own, to which they are
+    rounded; all other tensors but ``adam.last`` have the type of ``sh``.
 
     First the n skipped steps with zero gradient are applied: they multiply the moments by beta1^n
     and beta2^n and change the parameter by m / sqrt(v) times r + r^2 + ... + r^n, where
@@ -81,12 +82,14 @@ def sh_adam(sh: Tensor, grad: Tensor, updated: Tensor, adam: ShAdam) -> None:
     missed = (rates.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
     lr = torch.full(sh.shape[1:], rates.rates[1], dtype=sh.dtype)
     lr[0] = rates.rates[0]
+    lr /= 1 - rates.beta1**rates.step
+    scale = math.sqrt(1 - rates.beta2**rates.step)
     ratio = rates.beta1 / math.sqrt(rates.beta2)
     drift = ratio * (1 - ratio**missed) / (1 - ratio)
-    m, v, p = exp_avg[rows], exp_avg_sq[rows], sh[rows]
-    scale = math.sqrt(1 - rates.beta2**rates.step)
-    p -= lr / (1 - rates.beta1**rates.step) * drift * m / (v.sqrt() / scale + rates.eps)
-    m, v = m * rates.beta1**missed, v * rates.beta2**missed
-    adam_step(p, grad[rows], Moments(m, v), replace(rates, lr=lr.flatten().tolist()))
-    sh[rows], exp_avg[rows], exp_avg_sq[rows] = p, m, v
+    g, m, v = grad[rows], exp_avg[rows].to(sh.dtype), exp_avg_sq[rows]
+    p = sh[rows] - lr * drift * m / (v.sqrt() / scale + rates.eps)
+    m = rates.beta1 ** (missed + 1) * m + (1 - rates.beta1) * g
+    v = rates.beta2 ** (missed + 1) * v + (1 - rates.beta2) * g.square().mean(2, keepdim=True)
+    sh[rows] = p - lr * m / (v.sqrt() / scale + rates.eps)
+    exp_avg[rows], exp_avg_sq[rows] = m.to(exp_avg.dtype), v
     adam.last[rows] = rates.step

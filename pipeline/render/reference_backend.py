@@ -226,8 +226,9 @@ class ReferenceBackend(Backend[Projected, Projected]):
 
 def _step_sh(sh: Tensor, grad: Tensor, updated: Tensor, adam: ShAdam) -> None:
     checks.check_sh_adam(adam, sh)
-    with _in_double(sh, *vars(adam.moments).values()) as (p, *doubles):
-        reference_adam.sh_adam(p, grad, updated, replace(adam, moments=Moments(*doubles)))
+    with _in_double(sh, adam.moments.exp_avg_sq) as (p, v):
+        moments = replace(adam.moments, exp_avg_sq=v)
+        reference_adam.sh_adam(p, grad, updated, replace(adam, moments=moments))
 
 
 @contextmanager

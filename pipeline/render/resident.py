@@ -42,9 +42,9 @@ class Optimised:
     Attributes:
         parameters: means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,) and sh
             (N, K, 3), by name; and ``appearance`` (N, E, 3) if colours depend on the photograph.
-        first, second: Adam's moments by the names of the parameters. If means and rotations are
-            updated in the local frames, the moments of quats are (N, 3); otherwise the second
-            moments of means and quats are (N, 1).
+        first, second: Adam's moments by the names of the parameters. ``ShAdam`` has those of sh.
+            If means and rotations are updated in the local frames, the moments of quats are
+            (N, 3); otherwise the second moments of means and quats are (N, 1).
         last: (N,) int32, see ``ShAdam``.
         gradient_sum, seen: (N,) float32, the sums over the steps of the norm of the 2D mean's
             gradient in normalised device coordinates, and of visibility.

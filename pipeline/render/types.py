@@ -238,7 +238,7 @@ class AdamRates:
 
 @dataclass(frozen=True)
 class Moments:
-    """Adam's moments of a tensor: float32, updated in place.
+    """Adam's moments of a tensor: float32, updated in place. ``ShAdam`` has others.
 
     Attributes:
         exp_avg: The first moment, of the tensor's shape.
@@ -269,7 +269,9 @@ class ShAdam:
     result equals dense Adam, except for the colour that is rendered in that step.
 
     Attributes:
-        moments: The moments of the coefficients, (N, K, 3) each.
+        moments: The first moments of the coefficients, (N, K, 3) bfloat16, rounded to nearest,
+            ties to even; and the second moments (N, K, 1) float32, of the mean square of each
+            coefficient's channels.
         last: (N,) int32, the last step with a gradient, 0 before the first; updated in place.
         rates: The rates of the constant coefficient and of the others.
     """

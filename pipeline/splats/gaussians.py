@@ -155,10 +155,10 @@ def concat(parts: list[Gaussians]) -> Gaussians:
 
 
 def resize_bands(sh: Tensor, degree: int) -> Tensor:
-    """Truncate or zero-pad (N, K, 3) coefficients to (N, (degree + 1)^2, 3), contiguous."""
+    """Truncate or zero-pad (N, K, ...) coefficients to (N, (degree + 1)^2, ...), contiguous."""
     import torch
 
     bands = (degree + 1) ** 2
     if bands <= sh.shape[1]:
         return sh[:, :bands].contiguous()
-    return torch.cat([sh, sh.new_zeros(len(sh), bands - sh.shape[1], 3)], 1)
+    return torch.cat([sh, sh.new_zeros(len(sh), bands - sh.shape[1], *sh.shape[2:])], 1)

@@ -90,7 +90,7 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     ),
     "gpu_counts": (
         GPU_COUNTS,
-        "| 200k, 960x540 | 447,000 | 1 in 4 steps | 74 | 0 | 770 | 356 | 2.16 | 3.0 |",
+        "| 200k, 960x540 | 447,000 | 1 in 4 steps | 74 | 0 | 770 | 267 | 2.89 | 3.0 |",
     ),
     "gpu_model": (
         GPU_COUNTS,

@@ -47,7 +47,7 @@ def test_a_step_takes_few_dispatches(counts: Counts) -> None:
 def test_parameters_and_moments_are_read_and_written_once(counts: Counts) -> None:
     traffic = counts.traffic
     assert traffic is not None
-    floats = {"sh": 48, "geometry": 11, "first sh": 48, "second sh": 48, "moments": 20,
+    floats = {"sh": 48, "geometry": 11, "first sh": 24, "second sh": 16, "moments": 20,
               "statistics": 2}  # fmt: skip
     for name, width in floats.items():
         once = 4 * width * GAUSSIANS * STEPS

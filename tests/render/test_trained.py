@@ -19,7 +19,7 @@ from tests.tools import need_gpu
 
 COUNT = 400
 # The bytes of a Gaussian with three SH bands: parameters, moments, ``last`` and statistics.
-GEOMETRY, ALL = 4 * (11 + 2), 4 * (59 + 2 * 58 + 1 + 2)
+GEOMETRY, ALL = 4 * (11 + 2), 4 * (59 + 2 * 10 + 24 + 16 + 1 + 2)
 
 
 def drawn(embedding: tuple[float, ...] | None = (0.7, -1.2)) -> Optimised:
@@ -64,7 +64,8 @@ def test_selected_rows_are_copies_or_blank(trained: Trained) -> None:
     trained.load(before, Part.ALL)
     row = with_rows(before, 1)
     for arrays in (row.parameters, row.first, row.second):
-        arrays["sh"] = torch.empty(1, 25, 3)  # type: ignore[index]
+        sh = arrays["sh"]
+        arrays["sh"] = sh.new_empty(1, 25, sh.shape[2])  # type: ignore[index]
     for number, moments in enumerate((row.first, row.second)):
         for tensor in moments.values():
             tensor.copy_(number + torch.rand(tensor.shape, generator=draws))

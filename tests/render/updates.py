@@ -20,12 +20,14 @@ def made_adam(parameters: Parameters) -> GaussianAdam:
         first, second = torch.randn(2, *like.shape, generator=draws)
         return Moments(1e-3 * first, 1e-6 * second.square())
 
+    first, second = vars(moments(sh)).values()
+    of_sh = Moments(first.bfloat16(), second[..., :1].contiguous())
     last = torch.randint(0, STEP, (len(means),), generator=draws, dtype=torch.int32)
     return GaussianAdam(
         FrameMoments(moments(means), moments(means)), AdamRates((1e-2, 1e-3), STEP),
         moments(log_scales), AdamRates(5e-3, STEP, beta1=0.8),
         moments(opacity_logits), AdamRates(2e-2, STEP, eps=1e-9),
-        ShAdam(moments(sh), last, AdamRates((1e-2, 1e-3), STEP)),
+        ShAdam(of_sh, last, AdamRates((1e-2, 1e-3), STEP)),
     )  # fmt: skip
 
 

@@ -164,7 +164,7 @@ class GpuBackend(Backend[Projected, Binned]):
         else:
             checks.check_sh_adam(sh_adam, sh)
             tensors = {**vars(sh_adam.moments), "last_step": sh_adam.last}
-            more = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
+            more = {name: gpu.upload(layout.join([each])) for name, each in tensors.items()}
         if camera:
             more["d_camera"] = gpu.empty(4 * layout.CAMERA_PARAMETERS * count)
         # A copy of the SH coefficients: further views may be rendered from the same projection.

@@ -59,9 +59,9 @@ def moments(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> Tensor
 
 
 def words(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """The sections of an array of tensors (N, ...) of any type, in words."""
+    """The sections of an array of tensors (N, ...) of any type, in words, as of ``join``."""
     return {
-        name: math.prod(tensor.shape[1:]) * tensor.element_size() // 4
+        name: -(-math.prod(tensor.shape[1:]) * tensor.element_size() // 4)
         for name, tensor in tensors.items()
     }
 
@@ -81,8 +81,17 @@ def offsets(sections: Mapping[str, int], count: int) -> dict[str, tuple[int, int
 
 
 def join(tensors: Iterable[Tensor]) -> NDArray[Any]:
-    """The numbers of tensors of one type, one tensor after another."""
-    return np.concatenate([tensor.detach().numpy().reshape(-1) for tensor in tensors])
+    """The numbers of tensors of one type, one tensor after another; see ``_numbers``."""
+    return np.concatenate([_numbers(tensor.detach()).reshape(-1) for tensor in tensors])
+
+
+def _numbers(tensor: Tensor) -> NDArray[Any]:
+    """The numbers of a tensor as they lie in a buffer. Rows of bfloat16 are padded to whole words,
+    so that no two threads write to one."""
+    if tensor.dtype != torch.bfloat16:
+        return tensor.numpy()
+    rows = tensor.flatten(1).view(torch.uint16).numpy()
+    return np.pad(rows, ((0, 0), (0, rows.shape[1] % 2)))
 
 
 def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> Tensors:
@@ -95,11 +104,16 @@ def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> T
 
 
 def fetch(gpu: Gpu, buffer: Buffer, *tensors: Tensor) -> None:
-    """Copy a buffer into tensors of one type, which lie in it one after another."""
-    sizes = [tensor.numel() for tensor in tensors]
-    found = torch.from_numpy(gpu.read(buffer, tensors[0].detach().numpy().dtype, sum(sizes)))
-    for tensor, part in zip(tensors, found.split(sizes), strict=True):
-        tensor.detach().copy_(part.view(tensor.shape))
+    """Copy a buffer into tensors of one type, which lie in it as of ``join``."""
+    shapes = [_numbers(tensor.detach()) for tensor in tensors]
+    found = gpu.read(buffer, shapes[0].dtype, sum(each.size for each in shapes))
+    at = 0
+    for tensor, like in zip(tensors, shapes, strict=True):
+        rows = torch.from_numpy(found[at : at + like.size].reshape(like.shape))
+        if tensor.dtype == torch.bfloat16:
+            rows = rows[:, : tensor[:1].numel()].contiguous().view(torch.bfloat16)
+        tensor.detach().copy_(rows.reshape(tensor.shape))
+        at += like.size
 
 
 def tiles_of(width: int, height: int) -> tuple[int, int]:

@@ -33,12 +33,11 @@ def training_bytes(size: TrainingSize, cached: int) -> int:
     Args:
         cached: The maximum bytes of the training images on the device.
     """
-    parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
     per_gaussian = layout.RECORD_BYTES + GAUSSIAN_BYTES
     per_gaussian += PAIRS_PER_GAUSSIAN * PAIR_BYTES
-    # Parameters with two moments. Those of SH are among the large arrays once, and once more while
-    # their rows are selected.
-    moments = 3 * parameters
+    # Geometry with two moments, the moments of SH (see ``ShAdam``), and SH once more while rows
+    # of them are selected.
+    moments = 3 * 4 * layout.floats(layout.GEOMETRY) + (10 + 12) * size.sh_coefficients
     return (
         sum(large_arrays(size).values())
         + (moments + per_gaussian) * size.gaussians

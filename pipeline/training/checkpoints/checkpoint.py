@@ -24,7 +24,7 @@ from pipeline.training.run import TrainingRun
 KEPT = 2
 PATTERN = "checkpoint_*.npz.sha256"
 # Increment when the contents of checkpoints or their meaning change.
-STATE_VERSION = 21
+STATE_VERSION = 22
 
 
 @dataclass

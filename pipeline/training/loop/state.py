@@ -152,7 +152,10 @@ class TrainState:
         result: dict[str, NDArray[Any]] = {"order": self.order}
         for name, tensor in self.gaussians.tensors().items():
             result[f"parameter.{name}"] = tensor.numpy()
-            result[f"first.{name}"] = self.adam.first[name].numpy()
+            first = self.adam.first[name]
+            # numpy has no bfloat16.
+            bits = first.view(torch.uint16) if first.dtype == torch.bfloat16 else first
+            result[f"first.{name}"] = bits.numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
         result |= self.density.arrays() | self.cameras.arrays()
         if self.appearance is not None:
@@ -200,10 +203,12 @@ class TrainState:
         self.step, self.order = step, arrays["order"]
         self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians, self.adam.options, self.adam.backend)
-        first, second = (
-            {name: torch.from_numpy(arrays[f"{each}.{name}"]) for name in self.gaussians.tensors()}
-            for each in ("first", "second")
-        )
+        names = self.gaussians.tensors()
+        first = {
+            name: torch.from_numpy(arrays[f"first.{name}"]).view(self.adam.first[name].dtype)
+            for name in names
+        }
+        second = {name: torch.from_numpy(arrays[f"second.{name}"]) for name in names}
         self.adam.restore(first, second, torch.from_numpy(arrays["last"]))
         self.density.restore(arrays)
         self.cameras.restore(arrays)

@@ -107,10 +107,11 @@ class Adam:
 
     Attributes:
         backend: The backend that performs the updates.
-        first, second: The moments by the name of the array, of its shape, float32. With
-            ``own_frames``, those of quaternions are (N, 3), about the axes. Without, the second
-            moments of means and quaternions are (N, 1), shared by their components. Either way,
-            results do not depend on the orientation of the world.
+        first, second: The moments by the name of the array, of its shape, float32; those of
+            ``sh`` have the shapes and types of ``ShAdam``. With ``own_frames``, those of
+            quaternions are (N, 3), about the axes. Without, the second moments of means and
+            quaternions are (N, 1), shared by their components. Either way, results do not depend
+            on the orientation of the world.
         last: (N,) int32, the last step in which each row had a gradient.
         frozen: (N,) bool, the rows that steps do not change.
     """
@@ -122,6 +123,8 @@ class Adam:
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         count = len(gaussians)
+        self.first["sh"] = self.first["sh"].bfloat16()
+        self.second["sh"] = torch.zeros(count, gaussians.sh.shape[1], 1)
         if options.own_frames:
             self.first["quats"] = torch.zeros(count, 3)
             self.second["quats"] = torch.zeros(count, 3)

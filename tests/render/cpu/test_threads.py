@@ -58,7 +58,8 @@ def every_operator(threads: int) -> dict[str, Tensor]:
     composed = backend.compose_backward(around, fwd.alpha, loss.grad, change, threads)
     found |= dict(zip(("d_composed", "d_alpha"), composed, strict=True))
 
-    sh_moments, last = Moments(*torch.zeros(2, *sh.shape)), torch.zeros(COUNT, dtype=torch.int32)
+    sh_moments = Moments(torch.zeros_like(sh).bfloat16(), torch.zeros_like(sh[..., :1]))
+    last = torch.zeros(COUNT, dtype=torch.int32)
     every = {"colors": True, "camera": True}
     g = backend.backward(fwd, loss.grad, fwd.alpha, fwd.median_depth, **every)
     found |= {f"d_{name}": getattr(g, name) for name in GRADIENTS}

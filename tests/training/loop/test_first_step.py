@@ -61,6 +61,8 @@ def test_each_parameter_has_its_own_learning_rate(
             steps = torch.einsum("nij,ni->nj", axes, steps) / first.log_scales.exp()
         elif name == "means":
             steps = steps.square().mean(1).sqrt() / world_unit
+        elif name == "sh":
+            steps = steps.square().mean(2).sqrt()
         elif name == "quats":
             steps = steps.square().mean(1).sqrt()
             if unit == "gaussian_scale":  # three ways to turn a quaternion of length 1

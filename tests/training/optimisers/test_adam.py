@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipeline.render import AdamRates, FrameMoments, Moments, RasterOptions, make_backend
+from pipeline.render import AdamRates, FrameMoments, Moments, RasterOptions, ShAdam, make_backend
 from pipeline.render import reference_adam as float64
 from pipeline.render.views import raster_camera
 from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep, Rates
@@ -26,8 +26,9 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
     frames = FrameMoments(Moments(*zeros[:2]), Moments(*zeros[2:]))
     first = {name: torch.zeros_like(leaves[name]) for name in shared}
     groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh" and n not in shared]
-    dc, rest = leaves["sh"][:, :1].clone(), leaves["sh"][:, 1:].clone()
-    groups += [(dc, RATES.sh0), (rest, RATES.shN)]
+    sh = leaves["sh"].double()
+    sh_moments = Moments(torch.zeros_like(sh).bfloat16(), torch.zeros_like(sh[..., :1]))
+    last, updated = torch.zeros(37, dtype=torch.int32), torch.ones(37, dtype=torch.bool)
     reference = torch.optim.Adam(
         [{"params": [p], "lr": lr} for p, lr in groups], betas=(0.8, 0.999), eps=1e-15
     )
@@ -42,8 +43,10 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
         for name in leaves:
             if name != "sh" and name not in shared:
                 leaves[name].grad = getattr(gradients, name)
-        dc.grad, rest.grad = gradients.sh[:, :1], gradients.sh[:, 1:]
         reference.step()
+        sh_rates = AdamRates((RATES.sh0, RATES.shN), step, 0.8)
+        theirs = ShAdam(sh_moments, last, sh_rates)
+        float64.sh_adam(sh, gradients.sh.double(), updated, theirs)
         if own_frames:
             float64.frame_adam(
                 leaves["means"], leaves["quats"], scales, gradients.means, gradients.quats,
@@ -56,9 +59,11 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
                 float64.adam_step(leaves[name], gradient, moments, AdamRates(rate, step, 0.8))
         backward(drawn, d_color, sh_adam=adam.harmonics(AdamStep(step, RATES, 1)))
         adam.step(gaussians, gradients, AdamStep(step, RATES, 1), 1)
-    leaves["sh"] = torch.cat([dc, rest], 1)
     for name, tensor in gaussians.tensors().items():
-        assert torch.allclose(tensor, leaves[name], rtol=1e-5, atol=1e-5), name
+        # A gradient in float64 can round another first moment of sh.
+        atol = 2**-7 * RATES.sh0 if name == "sh" else 1e-5
+        expected = sh.float() if name == "sh" else leaves[name]
+        assert torch.allclose(tensor, expected, rtol=1e-5, atol=atol), name
 
 
 def first_step(epsilon: float) -> dict[str, torch.Tensor]:

@@ -164,8 +164,8 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
 splat::ShAdam sh_adam_from(const Tensor& sh, const Tensor& exp_avg, const Tensor& exp_avg_sq,
                            const Tensor& last, const Tensor& adam) {
     const splat::AdamSettings s = settings_from(adam);
-    return {{mutable_floats(sh), mutable_floats(exp_avg), mutable_floats(exp_avg_sq),
-             last.mutable_data_ptr<int32_t>()},
+    return {{mutable_floats(sh), static_cast<uint16_t*>(exp_avg.mutable_data_ptr()),
+             mutable_floats(exp_avg_sq), last.mutable_data_ptr<int32_t>()},
             {s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step}};
 }
 

@@ -226,9 +226,10 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         store_first(out.opacity_logits, g.opacity_logit, group.count);
         write_rows(g.means2d, group.count, out.means2d);
         if (out.colors) write_rows(d_rgb, group.count, out.colors);
-        sh.to_rows(view.sh_degree);
-        if (out.sh) sh.write(view.sh_degree, out.sh, sh_width, group.count);
-        if (sh_adam) sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
+        if (sh_adam)
+            sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
+        else if (out.sh)
+            sh.write(view.sh_degree, out.sh, sh_width, group.count);
     };
     parallel_for((count + kBlock - 1) / kBlock, kBlocksPerRange, threads, [&](int64_t block) {
         const int64_t begin = kBlock * block, end = std::min(begin + kBlock, count);

@@ -76,8 +76,9 @@ struct ShBlock {
     SPLAT_INLINE void to_rows(int degree) {
         for (int j = 0; 16 * j < 3 * sh_count(degree); j++) transpose(value + 16 * j);
     }
-    // Writes `count` rows after to_rows, with zeros after the active floats.
-    SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) const {
+    // Transposes and writes `count` rows, with zeros after the active floats.
+    SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) {
+        to_rows(degree);
         const int active = 3 * sh_count(degree);
         for (int lane = 0; lane < count; lane++) {
             float* const row = sh + width * lane;

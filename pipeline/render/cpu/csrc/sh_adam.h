@@ -2,10 +2,14 @@
 // only for Gaussians with a gradient: SH are four fifths of the parameters, and most Gaussians are
 // outside a view or occluded. The effect of skipped steps (decay of the moments and the resulting
 // change of the parameter) is applied at the next update.
+//
+// The update is limited by memory: first moments are bfloat16, and the channels of a coefficient
+// share the second moment of their mean square.
 #pragma once
 
 #include <cmath>
 
+#include "bfloat16.h"
 #include "sh.h"
 #include "simd_math.h"
 
@@ -17,9 +21,12 @@ struct ShAdamSettings {
     int64_t step;  // from 1
 };
 
-// Moments of sh (N, K, 3) and the step of each Gaussian's last update (N), 0 before the first.
+// The coefficients (N, K, 3), their first moments in bfloat16, their second moments (N, K), and the
+// step of each Gaussian's last update (N), 0 before the first.
 struct ShAdamState {
-    float *sh, *exp_avg, *exp_avg_sq;
+    float* sh;
+    uint16_t* exp_avg;
+    float* exp_avg_sq;
     int32_t* last;
 };
 
@@ -37,10 +44,19 @@ class ShAdam {
         for (int missed = 0; missed < kTable; missed++) table_[missed] = after(missed);
     }
 
-    // gradient: of the group that starts at Gaussian `first`, after ShBlock::to_rows.
-    SPLAT_INLINE void update(int degree, const ShBlock& gradient, int64_t first, int64_t width,
+    // gradient: of the group that starts at Gaussian `first`, before ShBlock::to_rows, which this
+    // function calls.
+    SPLAT_INLINE void update(int degree, ShBlock& gradient, int64_t first, int64_t width,
                              uint32_t lanes) const {
-        const int active = 3 * sh_count(degree);
+        const int count = sh_count(degree);
+        f32x16 squares[16] = {};
+        for (int k = 0; k < count; k++) {
+            for (int c = 0; c < 3; c++)
+                squares[k] += gradient.value[3 * k + c] * gradient.value[3 * k + c];
+            squares[k] *= rest2_ / 3;
+        }
+        transpose(squares);
+        gradient.to_rows(degree);
         for (; lanes; lanes &= lanes - 1) {
             const int lane = __builtin_ctz(lanes);
             const int64_t row = width * (first + lane);
@@ -48,21 +64,25 @@ class ShAdam {
             const int64_t missed = last < step_ ? step_ - 1 - last : 0;
             last = int32_t(step_);
             const Past past = missed < kTable ? table_[missed] : after(missed);
-            for (int j = 0; 16 * j < active; j++) {
-                const int here = active - 16 * j < 16 ? active - 16 * j : 16;
+            float* const second = state_.exp_avg_sq + row / 3;
+            f32x16 v = load_first(second, count);
+            alignas(64) float before[48], now[48];
+            if (missed) each_channel(inverse_root(v) * past.drift, before);
+            v = v * past.keep2 + squares[lane];
+            each_channel(inverse_root(v), now);
+            store_first(second, v, count);
+            for (int j = 0; 16 * j < 3 * count; j++) {
+                const int here = 3 * count - 16 * j < 16 ? 3 * count - 16 * j : 16;
                 const int64_t at = row + 16 * j;
                 f32x16 p = load_first(state_.sh + at, here);
-                f32x16 m = load_first(state_.exp_avg + at, here);
-                f32x16 v = load_first(state_.exp_avg_sq + at, here);
+                f32x16 m = load_bfloat16(state_.exp_avg + at, here);
                 const f32x16 g = gradient.value[16 * j + lane],
                              rate = load<f32x16>(rates_ + 16 * j);
-                if (missed) p -= rate * past.drift * m * inverse_root(v);
+                if (missed) p -= rate * m * load<f32x16>(before + 16 * j);
                 m = m * past.keep1 + g * rest1_;
-                v = v * past.keep2 + g * g * rest2_;
-                p -= rate * m * inverse_root(v);
+                p -= rate * m * load<f32x16>(now + 16 * j);
                 store_first(state_.sh + at, p, here);
-                store_first(state_.exp_avg + at, m, here);
-                store_first(state_.exp_avg_sq + at, v, here);
+                store_bfloat16(state_.exp_avg + at, m, here);
             }
         }
     }
@@ -79,6 +99,12 @@ class ShAdam {
         const float n = float(missed);
         return {std::pow(beta1_, n + 1), std::pow(beta2_, n + 1),
                 ratio_ * (1 - std::pow(ratio_, n)) / (1 - ratio_)};
+    }
+
+    // Values of coefficients in the order of a row: three times each.
+    SPLAT_INLINE static void each_channel(f32x16 v, float (&row)[48]) {
+        const f32x16 channels[3] = {v, v, v};
+        interleave(channels, row);
     }
 
     // An infinite moment (of a gradient above 1e19) gives no change, as a division would.

@@ -17,7 +17,7 @@ const kCamera = 2u;
 // Sections of N rows: those of geometry, then 2D means and colours.
 @group(0) @binding(7) var<storage, read_write> gradients: array<f32>;
 @group(0) @binding(8) var<storage, read_write> d_sh: array<f32>;
-@group(0) @binding(9) var<storage, read_write> exp_avg: array<f32>;  // of sh
+@group(0) @binding(9) var<storage, read_write> exp_avg: array<u32>;  // of sh
 @group(0) @binding(10) var<storage, read_write> exp_avg_sq: array<f32>;
 @group(0) @binding(11) var<storage, read_write> last_step: array<i32>;
 @group(0) @binding(12) var<storage, read_write> d_camera: array<f32>;  // (N, kCameraParameters)

@@ -30,7 +30,7 @@ const kColors = 4u;  // writes the gradients of colours
 @group(0) @binding(7) var<storage, read> tile_counts: array<u32>;
 @group(0) @binding(8) var<storage, read> slot_of: array<u32>;  // the first of each Gaussian
 @group(0) @binding(9) var<storage, read> slots: array<f32>;
-@group(0) @binding(10) var<storage, read_write> exp_avg: array<f32>;  // of sh
+@group(0) @binding(10) var<storage, read_write> exp_avg: array<u32>;  // of sh
 @group(0) @binding(11) var<storage, read_write> exp_avg_sq: array<f32>;
 @group(0) @binding(12) var<storage, read_write> last_step: array<i32>;
 // The first and the second moments of log scales, then those of opacities, of means and of rotations.

@@ -326,18 +326,23 @@ def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:
 
 
 @pytest.mark.parametrize(
-    ("degree", "stored"), [(0, 0), (1, 1), (2, 2), (3, 3), (0, 3), (2, 3)]
-)  # fmt: skip
-def test_sh_adam_equals_the_reference(any_backend: Backend, degree: int, stored: int) -> None:
+    ("degree", "stored", "size"),
+    [(0, 0, 1), (1, 1, 1), (2, 2, 1), (3, 3, 1), (0, 3, 1), (2, 3, 1), (3, 3, 1e-7), (3, 3, 1e7)],
+)
+def test_sh_adam_equals_the_reference(
+    any_backend: Backend, degree: int, stored: int, size: float
+) -> None:
+    """``size`` is that of gradients and first moments: those of large images are tiny."""
     scene, cam, d_color = sh_scene(stored)
+    d_color *= size
     fwd = any_backend.forward(*scene, cam, RasterOptions(sh_degree=degree))
     plain = any_backend.backward(fwd, d_color)
     sh = scene[4]
     # Some were updated last many steps ago.
     last = torch.randint(0, 1000, (len(sh),), generator=torch.manual_seed(4), dtype=torch.int32)
     last[::2] = 998
-    first = (1e-3 * normal(*sh.shape, seed=4)).bfloat16()
-    moments = Moments(first, 1e-5 * normal(*sh.shape[:2], 1, seed=5).abs())
+    first = (1e-3 * size * normal(*sh.shape, seed=4)).bfloat16()
+    moments = Moments(first, 1e-5 * size**2 * normal(*sh.shape[:2], 1, seed=5).abs())
     for moment in vars(moments).values():
         moment[:, (degree + 1) ** 2 :] = 0  # Not used so far.
     doubles = Moments(first.clone(), moments.exp_avg_sq.double())
@@ -354,7 +359,7 @@ def test_sh_adam_equals_the_reference(any_backend: Backend, degree: int, stored:
     # All are equal but some close to the middle between two values of bfloat16.
     differ = moments.exp_avg != doubles.exp_avg
     assert differ.double().mean() < 1e-3
-    torch.testing.assert_close(moments.exp_avg, doubles.exp_avg, rtol=2.0**-7, atol=1e-12)
+    torch.testing.assert_close(moments.exp_avg, doubles.exp_avg, rtol=2.0**-7, atol=1e-12 * size)
     assert relative(moments.exp_avg_sq, doubles.exp_avg_sq) < 1e-5
     assert torch.equal(ours.last, theirs.last)
     assert torch.equal(moments.exp_avg[~updated], untouched[~updated])

@@ -15,8 +15,8 @@ from benchmarks.results import GpuCountsResult
 
 # The least bytes of a step, each number read and written once: of a Gaussian, 11 parameters with
 # two moments each, 48 SH coefficients with first moments of 2 bytes and 16 second moments, two
-# statistics and its last step; of a pair, its Gaussian and ten moments of gradients; of a pixel, its
-# colour and the gradient on it, while the photograph's bytes are only read.
+# statistics and its last step; of a pair, its Gaussian and ten moments of gradients; of a pixel,
+# its colour and the gradient on it, while the photograph's bytes are only read.
 GAUSSIAN_BYTES = 2 * (4 * 3 * 11 + (4 + 2) * 48 + 4 * 16 + 4 * 3)
 PAIR_BYTES, PIXEL_BYTES = 2 * 4 * 11, 2 * 4 * 6 + 3
 DISPATCH_MS = 4e-3  # Assumed: the start of a kernel and the barrier before it.

@@ -90,7 +90,7 @@ EXAMPLES: dict[str, tuple[Any, str]] = {
     ),
     "gpu_counts": (
         GPU_COUNTS,
-        "| 200k, 960x540 | 447,000 | 1 in 4 steps | 74 | 0 | 770 | 267 | 2.89 | 3.0 |",
+        "| 200k, 960x540 | 447,000 | 1 in 4 steps | 74 | 0 | 770 | 264 | 2.91 | 3.0 |",
     ),
     "gpu_model": (
         GPU_COUNTS,

@@ -12,8 +12,8 @@ struct RowCopy {
     int64_t bytes;  // of a row
 };
 
-// Row i of each copy becomes row rows[i] (count) of its source, or zeros where zeroed (count), which
-// may be null, is set.
+// Row i of each copy becomes row rows[i] (count) of its source, or zeros where zeroed (count),
+// which may be null, is set.
 void take_rows(const std::vector<RowCopy>& copies, const int64_t* rows, const bool* zeroed,
                int64_t count, int threads);
 

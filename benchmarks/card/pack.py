@@ -111,7 +111,7 @@ def pack_scene(folder: Path, export: Path, scene: Path, views: int) -> None:
         with Image.open(file) as image:
             image.convert("RGB").save(out / "images" / images[number].name, quality=QUALITY)
     write_model(out / "sparse" / "0", _of_images(model, images))
-    # A seventh of the size; a frame takes the same time.
+    # SPZ is a fraction of the size of PLY, and a frame takes the same time.
     write_spz(out / "point_cloud.spz", read_splat_ply(export / "point_cloud.ply"))
 
 

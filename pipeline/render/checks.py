@@ -206,7 +206,8 @@ def check_update(
         if checked("parameters", tensor, shape).data_ptr() != tensor.data_ptr():
             raise ValueError("update: parameters must be contiguous")
     for tensor in statistics or ():
-        checked("statistics", tensor, (count,))
+        if checked("statistics", tensor, (count,)).data_ptr() != tensor.data_ptr():
+            raise ValueError("update: statistics must be contiguous")
     check_frame_adam((means, quats, log_scales), (means, quats), adam.frames, adam.frame_rates)
     for parameter, moments, rates in (
         (log_scales, adam.log_scales, adam.log_scale_rates),

@@ -86,3 +86,6 @@ def test_invalid_arguments_are_errors(backend: Backend) -> None:
     with pytest.raises(ValueError, match="statistics"):
         seen = torch.zeros(8)
         backend.update(fwd, scene, d_color, adam=adam, statistics=(seen, seen))
+    every_second = torch.zeros(18)[::2]
+    with pytest.raises(ValueError, match="contiguous"):
+        backend.update(fwd, scene, d_color, adam=adam, statistics=(every_second, every_second))
